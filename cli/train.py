@@ -192,9 +192,9 @@ def train(
     --resume continues from it.
 
     Known cameras are a COLMAP model in sparse/ beside the photos in images/, or transforms.json or
-    transforms_train.json (nerfstudio, instant-ngp, NeRF's Blender sets). An OPF project (.opf) of Pix4D and the
-    cameras of Metashape (.xml) work, too. Without known cameras, the photos or the video are reconstructed first, into
-    MODEL/scene (see clsplat reconstruct).
+    transforms_train.json (nerfstudio, instant-ngp, NeRF's Blender sets). An OPF project (.opf) of Pix4D, the cameras of
+    Metashape (.xml) and a reconstruction.json of OpenSfM work, too. Without known cameras, the photos or the video are
+    reconstructed first, into MODEL/scene (see clsplat reconstruct).
 
     The model's folder gets config.json, cameras.json, log.jsonl, checkpoint.npz and
     point_cloud/iteration_N/point_cloud.ply. With --budget auto, the folder also gets budget.json and a chart of the

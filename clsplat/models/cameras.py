@@ -19,7 +19,7 @@ from ..scenes.export import points_file, relative_files, write_colmap, write_tra
 from ..scenes.options import CAMERA_FORMATS
 from ..scenes.posed_images import warn_of_left_out
 from ..scenes.scene import read_posed_images
-from ..scenes.scene_files import PHOTOGRAMMETRY_ENDINGS
+from ..scenes.scene_files import PHOTOGRAMMETRY_ENDINGS, is_opensfm
 from ..scenes.undistort import RegisteredImage, is_pinhole, make_lens, pinhole_camera
 from ..splats.harmonics import SH_C0
 from ..splats.shapes import shape_named
@@ -101,7 +101,7 @@ def _is_scene(source: Path) -> bool:
     """Return whether the source is a folder without a model, or a file of cameras that is a scene."""
     if source.is_dir():
         return not (source / "point_cloud").is_dir()
-    if source.suffix.lower() in PHOTOGRAMMETRY_ENDINGS:
+    if source.suffix.lower() in PHOTOGRAMMETRY_ENDINGS or is_opensfm(source):
         return source.is_file()
     if not source.is_file() or source.suffix != ".json":
         return False

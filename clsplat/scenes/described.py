@@ -8,9 +8,10 @@ from pathlib import Path
 from ..errors import InputError
 from .nerfstudio import read_transforms
 from .photogrammetry.metashape import read_metashape
+from .photogrammetry.opensfm import read_opensfm
 from .photogrammetry.opf import read_opf
 from .posed_images import PosedImages
-from .scene_files import METASHAPE_ENDING, OPF_ENDING
+from .scene_files import METASHAPE_ENDING, OPF_ENDING, is_opensfm
 
 _READERS = {OPF_ENDING: read_opf, METASHAPE_ENDING: read_metashape}
 
@@ -27,7 +28,7 @@ def read_described(files: Sequence[Path], images: str | None = None) -> PosedIma
     ------
     InputError : a file is damaged, or there are several OPF projects or several files of Metashape.
     """
-    reader = _READERS.get(files[0].suffix.lower())
+    reader = read_opensfm if is_opensfm(files[0]) else _READERS.get(files[0].suffix.lower())
     if reader is None:
         return read_transforms(list(files), images)
     if len(files) > 1:

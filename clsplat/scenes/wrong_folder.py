@@ -26,7 +26,6 @@ _MAX_NAMED = 5
 _TO_COLMAP = "export it as a COLMAP model"
 _OTHER_PROGRAMS = {  # by name or ending: whose reconstructions these are, and what a user can do
     "sfm_data.json": f"OpenMVG; {_TO_COLMAP} (openMVG_main_openMVG2Colmap)",
-    "reconstruction.json": f"OpenSfM; {_TO_COLMAP} (opensfm export_colmap)",
     "poses_bounds.npy": "LLFF; give its COLMAP model, or find the poses again with clsplat reconstruct",
     "bundle.out": f"Bundler; {_TO_COLMAP}",
     "*.sfm": f"AliceVision; {_TO_COLMAP}",

@@ -112,7 +112,6 @@ def test_a_model_without_photos_beside_it_has_them_named(data: Path, tmp_path: P
     ("name", "said"),
     [
         ("sfm_data.json", "OpenMVG; export it as a COLMAP model (openMVG_main_openMVG2Colmap)"),
-        ("reconstruction.json", "OpenSfM; export it as a COLMAP model (opensfm export_colmap)"),
         ("poses_bounds.npy", "LLFF; give its COLMAP model, or find the poses again with clsplat reconstruct"),
         ("a.nvm", "VisualSFM; export it as a COLMAP model"),
     ],
