@@ -12,6 +12,7 @@ from typing import Any
 
 import glb_files
 import numpy as np
+import opensfm_files
 import packed_ply
 import photogrammetry_files
 import sog_files
@@ -136,6 +137,11 @@ def make_opf(folder: Path) -> None:
     tracks = folder / "calibration" / "tracks.gltf"
     photogrammetry_files.write_opf_cloud(tracks, xyz, rgb, [3] * len(xyz), (1.0, 2.0, 3.0))
     photogrammetry_files.opf_project().write(folder)
+
+
+def make_opensfm(folder: Path) -> None:
+    make_survey(folder)
+    (folder / "reconstruction.json").write_text(json.dumps([opensfm_files.reconstruction()]))
 
 
 def make_metashape(folder: Path) -> None:
@@ -402,6 +408,7 @@ READERS = {
     "transforms": Sample(make_transforms, read_scene),
     "blender": Sample(make_blender, read_scene),
     "opf": Sample(make_opf, read_scene),
+    "opensfm": Sample(make_opensfm, read_scene, "reconstruction.json"),
     "metashape": Sample(make_metashape, read_scene, "cameras.xml"),
     "photographs": Sample(make_photographs, read_photographs),
     "scene-facts": Sample(make_masked, read_facts),
