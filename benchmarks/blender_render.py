@@ -11,6 +11,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from blender_flat import flat, walk
 from blender_objects import dishes, metals, plant, wires
 from blender_places import garden, lane, room
 from mathutils import Matrix, Vector
@@ -18,7 +19,6 @@ from mathutils import Matrix, Vector
 FIELD_OF_VIEW = 0.6911112  # of NeRF-synthetic, horizontal [radians]
 DISTANCE = 4.031  # of its cameras from the origin [world units]
 PLACE_FIELD_OF_VIEW = 1.1  # inside a place [radians]
-SAMPLES = 16  # paths of a pixel, before the denoiser
 POINTS = 12000  # of a place
 NOISE = 0.003  # standard deviation of its points around the surfaces [world units]
 FAR_NOISE = 0.002  # the same along the ray, outdoors, at one world unit: it grows with the square of the depth
@@ -84,14 +84,25 @@ def lane_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[l
     return every_few(poses, n_test)
 
 
+def flat_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[list[Matrix], list[Matrix]]:
+    """Return the poses of a walk through the flat."""
+    return every_few([look_at(eye, target) for eye, target in walk(rng, n_train + n_test)], n_test)
+
+
 @dataclass(frozen=True)
 class SceneKind:
-    """How a scene is photographed. around : photos have no transparent pixels. outdoors : the noise of points grows."""
+    """How a scene is photographed.
+
+    around : photos have no transparent pixels. outdoors : the noise of points grows. field_of_view : horizontal
+    [radians]. samples : paths of a pixel, before the denoiser.
+    """
 
     build: Callable[[np.random.Generator], None]
     cameras: Callable[[np.random.Generator, int, int], tuple[list[Matrix], list[Matrix]]] = sphere_cameras
     around: bool = False
     outdoors: bool = False
+    field_of_view: float = FIELD_OF_VIEW
+    samples: int = 16
 
 
 SCENES = {
@@ -99,22 +110,23 @@ SCENES = {
     "metals": SceneKind(metals),
     "wires": SceneKind(wires),
     "dishes": SceneKind(dishes),
-    "room": SceneKind(room, room_cameras, around=True),
-    "garden": SceneKind(garden, garden_cameras, around=True, outdoors=True),
-    "lane": SceneKind(lane, lane_cameras, around=True, outdoors=True),
+    "room": SceneKind(room, room_cameras, True, False, PLACE_FIELD_OF_VIEW),
+    "flat": SceneKind(flat, flat_cameras, True, False, 1.2, 10),
+    "garden": SceneKind(garden, garden_cameras, True, True, PLACE_FIELD_OF_VIEW),
+    "lane": SceneKind(lane, lane_cameras, True, True, PLACE_FIELD_OF_VIEW),
 }
 
 
-def prepare(size: int, field_of_view: float, around: bool) -> Any:
+def prepare(size: int, kind: SceneKind) -> Any:
     """Set Cycles up, and return the camera's object."""
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
-    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.seed = SAMPLES, True, 0
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.seed = kind.samples, True, 0
     scene.cycles.max_bounces, scene.render.use_persistent_data = 6, True
     scene.render.resolution_x = scene.render.resolution_y = size
-    scene.render.film_transparent = not around
+    scene.render.film_transparent = not kind.around
     scene.view_settings.view_transform = "Standard"
-    scene.render.image_settings.color_mode = "RGB" if around else "RGBA"
+    scene.render.image_settings.color_mode = "RGB" if kind.around else "RGBA"
     world = bpy.data.worlds.new("sky")
     scene.world, world.use_nodes = world, True
     sky = world.node_tree.nodes.new("ShaderNodeTexSky")
@@ -123,7 +135,7 @@ def prepare(size: int, field_of_view: float, around: bool) -> Any:
     world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.06
     bpy.ops.object.camera_add()
     scene.camera = bpy.context.object
-    scene.camera.data.angle, scene.camera.data.clip_start = field_of_view, 0.01
+    scene.camera.data.angle, scene.camera.data.clip_start = kind.field_of_view, 0.01
     return scene.camera
 
 
@@ -173,8 +185,7 @@ def render(folder: Path, name: str, size: int, n_train: int, n_test: int) -> Non
     bpy.ops.wm.read_factory_settings(use_empty=True)
     rng, kind = np.random.default_rng(sum(map(ord, name))), SCENES[name]
     kind.build(rng)
-    angle = PLACE_FIELD_OF_VIEW if kind.around else FIELD_OF_VIEW
-    camera = prepare(size, angle, kind.around)
+    angle, camera = kind.field_of_view, prepare(size, kind)
     poses = dict(zip(("train", "test"), kind.cameras(rng, n_train, n_test), strict=True))
     folder.mkdir(parents=True, exist_ok=True)
     bpy.context.view_layer.update()
