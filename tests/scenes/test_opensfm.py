@@ -115,6 +115,7 @@ BAD: dict[str, tuple[Callable[[Values], Any], list[str]]] = {
     "a focal length of 0": (camera(focal=0), ["its focal length is not above 0"]),
     "a text as coefficient": (camera(k1="x"), ["'k1'"]),
     "a width of a half": (camera(width=0.5), ["'width' is 0.5"]),
+    "a huge height": (camera(height=1e15), ["its size is", "x1000000000000000 px; a side has at most"]),
     "a point without a place": (lambda v: v["points"]["1"].pop("coordinates"), ["point '1'", "'coordinates'"]),
     "a photo out of the folder": (
         lambda v: v["shots"].update({"a\0": v["shots"][made.NAMES[0]]}),

@@ -19,6 +19,7 @@ from ...errors import InputError, named_place
 from ...files.json_file import MAX_NUMBER, get_matrix, get_number, get_size, get_text, get_value, read_json
 from ...splats.quaternions import rotations
 from ..colmap import Points
+from ..photo_size import MAX_SIDE
 from ..posed_images import PosedImages, read_sizes
 from ..undistort import Lens, RegisteredImage, brown_lens, make_lens
 from .named_photos import find_named_photos
@@ -131,6 +132,8 @@ def _lens(camera: dict[str, Any], stored: tuple[int, int]) -> Lens:
     given_size = camera.get("width") and camera.get("height")
     width, height = (get_size(camera, key, REMEDY) for key in ("width", "height")) if given_size else stored
     side = max(width, height)
+    if side > MAX_SIDE:
+        raise InputError(f"its size is {width}x{height} px; a side has at most {MAX_SIDE} px")
 
     def optional(key: str) -> float:
         return get_number({key: 0.0} | camera, key, REMEDY)
