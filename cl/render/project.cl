@@ -162,8 +162,8 @@ kernel void project_splats(
 // Overwrites grad_geom and grad_sh, which have the rows of geom and sh, with zeros for splats that are not seen; of grad_sh
 // only the bands in use. If `compact`, grad_sh is [COMPACT_ROWS, capacity]: the gradient of the colour and the unit direction.
 // The gradient of sh is the product of the colour's and the basis in that direction.
-// Adds three numbers for densification to signals [3, capacity] for each seen splat. The first is the norm of the gradient of
-// mean_px in units of half the image (3DGS's normalised device coordinates). The second is the absolute gradient along the
+// Adds three numbers for densification to statistics [3, capacity] for each seen splat. The first is the norm of the gradient
+// of mean_px in units of half the image (3DGS's normalised device coordinates). The second is the absolute gradient along the
 // viewing ray [1/world unit] (3DSGS's depth gradient). The third is 1.
 kernel void project_splats_vjp(
     global const real *restrict geom,
@@ -174,7 +174,7 @@ kernel void project_splats_vjp(
     global const uint *restrict depth_key,
     global real *restrict grad_geom,
     global real *restrict grad_sh,
-    global real *restrict signals,
+    global real *restrict statistics,
     ulong capacity,
     uint n_splats,
     int sh_degree,
@@ -231,12 +231,12 @@ kernel void project_splats_vjp(
 
     const vreal half_x = g.mean_x * (vreal)(R(0.5) * (real)width), half_y = g.mean_y * (vreal)(R(0.5) * (real)height);
     const vreal along_ray = fabs(dot3(v_c, s.c)) / sqrt(dot3(s.c, s.c));
-    global real *signal = signals + first;
-    lanes_store(lanes_load(signal) + lanes_if(seen, sqrt(half_x * half_x + half_y * half_y), zero), signal);
-    signal += capacity;
-    lanes_store(lanes_load(signal) + lanes_if(seen, along_ray, zero), signal);
-    signal += capacity;
-    lanes_store(lanes_load(signal) + lanes_if(seen, (vreal)1, zero), signal);
+    global real *statistic = statistics + first;
+    lanes_store(lanes_load(statistic) + lanes_if(seen, sqrt(half_x * half_x + half_y * half_y), zero), statistic);
+    statistic += capacity;
+    lanes_store(lanes_load(statistic) + lanes_if(seen, along_ray, zero), statistic);
+    statistic += capacity;
+    lanes_store(lanes_load(statistic) + lanes_if(seen, (vreal)1, zero), statistic);
 
     vreal v_rgb[3], inv_norm, v_basis[SH_COUNT];
     for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);

@@ -192,7 +192,7 @@ class Pipeline:
             depth_key=projected.depth_key,
             grad_geom=grads.geom,
             grad_sh=grads.sh,
-            signals=self.statistics.reserve(splats.capacity),
+            statistics=self.statistics.reserve(splats.capacity),
             capacity=splats.capacity,
             n_splats=n,
             sh_degree=frame.sh_degree,

@@ -145,7 +145,7 @@ class SplatStatistics:
     """
 
     ROWS = 3
-    SCREEN_GRADIENT, TIMES_SEEN = 0, 2  # rows
+    SCREEN_GRADIENT, DEPTH_GRADIENT, TIMES_SEEN = range(ROWS)
 
     def __init__(self, pool: Pool, dtype: np.dtype[np.floating]) -> None:
         self.device, self.dtype = pool.device, dtype

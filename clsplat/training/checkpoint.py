@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from ..rendering.splat_buffers import SplatStatistics
 from ..splats.fields import MAX_SH_DEGREE, Array
 
 VERSION = 4
@@ -52,7 +53,7 @@ class Checkpoint:
     seconds : training time so far.
     schedule : schedule of the kernels, which their rounding depends on.
     n_first : number of splats at the start of the run, which the growth depends on.
-    signals : (3, N) densification statistics (SplatStatistics).
+    statistics : densification statistics, (SplatStatistics.ROWS, N).
     reached : limits of the schedules, if the run was made longer.
     average : state of the `ParameterAverage` by key, empty before the last part of the run.
     left_out : indices of training views that the rest of the run leaves out.
@@ -67,7 +68,7 @@ class Checkpoint:
     seconds: float
     schedule: str
     n_first: int
-    signals: Array
+    statistics: Array
     reached: Reached | None = None
     average: dict[str, NDArray[Any]] = field(default_factory=dict)
     left_out: list[int] = field(default_factory=list)
@@ -89,7 +90,7 @@ class Checkpoint:
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
         arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
         arrays |= {f"average.{k}": v for k, v in self.average.items()}
-        arrays["signals"] = self.signals
+        arrays[_STATISTICS] = self.statistics
         arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         with atomic_writer(path) as stream:
             np.savez(stream, **arrays)  # type: ignore[arg-type]
@@ -123,7 +124,7 @@ class Checkpoint:
                 meta["seconds"],
                 meta["schedule"],
                 meta["n_first"],
-                arrays["signals"],
+                arrays[_STATISTICS],
                 Reached(**meta["reached"]) if meta.get("reached") else None,
                 part("average."),
                 meta.get("left_out", []),
@@ -153,10 +154,13 @@ class Checkpoint:
                 raise ValueError(f"its {name} is not a list of views")
         np.random.default_rng().bit_generator.state = self.rng
         n = len(self.splats["mean"])
-        for group in (self.splats, self.optimizer, self.average, {"signals": self.signals}):
+        for group in (self.splats, self.optimizer, self.average, {_STATISTICS: self.statistics}):
             if not all(values.dtype.kind in "fiu" and values.ndim for values in group.values()):
                 raise ValueError("it holds something that is not an array of numbers")
-        if any(len(values) != n for values in self.splats.values()) or self.signals.shape != (3, n):
+        if any(len(values) != n for values in self.splats.values()) or self.statistics.shape != (
+            SplatStatistics.ROWS,
+            n,
+        ):
             raise ValueError("its arrays are not of the same splats")
         if self.average:
             shapes = {name: values.shape for name, values in self.average.items() if name != "count"}
@@ -166,6 +170,7 @@ class Checkpoint:
                 raise ValueError("its average has no count")
 
 
+_STATISTICS = "signals"  # key in the file, as in the first versions
 _KINDS = {
     "iteration": int,
     "config": dict,

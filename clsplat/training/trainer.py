@@ -177,7 +177,7 @@ class Trainer:
         for replica in self.batch.replicas[1:] if self.batch is not None else ():
             replica.exposure.follow(self.exposure)
         self.optimizer.load_state(state)
-        self.pipeline.statistics.write(checkpoint.signals, self.splats.capacity)
+        self.pipeline.statistics.write(checkpoint.statistics, self.splats.capacity)
 
     def run(self, folder: ModelFolder | None = None, visit: Visit | None = None) -> Model:
         """Train until the last iteration, or until Ctrl-C or another stop signal.

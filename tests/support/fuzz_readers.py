@@ -212,7 +212,7 @@ def read_checkpoint(folder: Path) -> None:
     found = fitting_checkpoint(ModelFolder(folder), TrainConfig(iterations=100))
     Schedule.parse(found.schedule)
     np.random.default_rng(0).bit_generator.state = found.rng
-    assert found.signals.shape == (3, len(found.splats["mean"]))
+    assert found.statistics.shape == (3, len(found.splats["mean"]))
 
 
 def make_model(folder: Path) -> None:

@@ -25,6 +25,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...rendering.splat_buffers import SplatStatistics
 from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, raw_of_optical_depth
 from ...splats.shapes import Shape
@@ -145,10 +146,13 @@ def _above_threshold(
 
     Gradients that are not finite do not count.
     """
-    times = np.maximum(stats[2], 1.0)
+    times = np.maximum(stats[SplatStatistics.TIMES_SEEN], 1.0)
     with np.errstate(over="ignore"):  # a threshold may be too large for float32: nothing exceeds it
-        deep = stats[1] * extent > 0.5 * depth_threshold * times if depth_threshold > 0 else None
-        loud = stats[0] > np.multiply(times, 0.5 * grad_threshold, out=times)  # faster than new memory
+        depth = stats[SplatStatistics.DEPTH_GRADIENT]
+        deep = depth * extent > 0.5 * depth_threshold * times if depth_threshold > 0 else None
+        loud = stats[SplatStatistics.SCREEN_GRADIENT] > np.multiply(
+            times, 0.5 * grad_threshold, out=times
+        )  # faster than new memory
         if deep is not None:
             loud |= deep
     rows = np.flatnonzero(loud)  # only these can exceed a threshold: few, so they may be in double precision
