@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -90,10 +91,28 @@ def check_left_out(root: Path, posed: PosedImages, left_out: Mapping[str, str]) 
             return
     n, used = len(listed), len(listed) - len(left_out)
     number = f"only {used}" if used else "none"
+    place = _place_of(root, [posed.files[name] for name in left_out if name in posed.files])
     raise InputError(
         f"{root}: {number} of its {n} photos can be used, at least {math.ceil(MIN_USABLE * n)} must be; "
-        f"copy them there, or name another folder of photos ({next(iter(left_out.values()))})"
+        f"copy them there, or name another folder of photos{place} ({next(iter(left_out.values()))})"
     )
+
+
+def _place_of(root: Path, files: Sequence[Path]) -> str:
+    """Return words that name a folder beside the scene's, or in it, with the first of the missing photos, or "".
+
+    ScanNet++ has its photos beside the folder of their poses.
+    """
+    home = root.parent if root.is_file() else root
+    missing = next((file.name for file in files if not file.is_file()), None)
+    if missing is None:
+        return ""
+    for folder, way in ((home, ""), (home.absolute().parent, "../")):
+        with suppress(OSError):  # the folder above may be closed to this user
+            for place in sorted(folder.iterdir()):
+                if place.is_dir() and (place / missing).is_file():
+                    return f", such as {way}{place.name}"
+    return ""
 
 
 def warn_of_left_out(root: Path, left_out: Mapping[str, str], n: int) -> None:

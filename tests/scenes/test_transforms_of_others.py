@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,14 @@ def test_photos_of_another_format(folder: Path) -> None:
     """After the object was cut out, say."""
     renamed = [entry | {"file_path": entry["file_path"].replace(".png", ".JPG")} for entry in frames()]
     assert len(load(folder, LENS | {"frames": renamed}).views) == len(model_views())
+
+
+@pytest.mark.parametrize(("place", "named"), [("garden/pictures", "pictures"), ("resized", "../resized")])
+def test_photos_in_another_folder_are_named(folder: Path, place: str, named: str) -> None:
+    (folder / "images").rename(folder.parent / place)
+    with pytest.raises(InputError, match=rf"or name another folder of photos, such as {re.escape(named)} \("):
+        load(folder, LENS | {"frames": frames("{}")})
+    assert len(load_scene(folder, images=named).views) == len(model_views())
 
 
 def test_axes_of_opencv(folder: Path) -> None:
