@@ -41,7 +41,6 @@ NAMED_IN = {
     "training/exposure.py": ("train",),
     "training/initialise.py": TRAINING,
     "training/optim/rules.py": ("train",),
-    "training/run.py": ("train",),
     "training/stages.py": ("train",),
     "training/stored_run.py": ("train",),
     "training/extension.py": ("train",),

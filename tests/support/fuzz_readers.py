@@ -141,7 +141,7 @@ def make_opf(folder: Path) -> None:
 
 def make_opensfm(folder: Path) -> None:
     make_survey(folder)
-    (folder / "reconstruction.json").write_text(json.dumps([opensfm_files.reconstruction()]))
+    (folder / "reconstruction.json").write_text(json.dumps([opensfm_files.reconstruction()]), encoding="utf-8")
 
 
 def make_metashape(folder: Path) -> None:

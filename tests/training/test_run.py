@@ -116,7 +116,7 @@ def test_a_cap_below_the_points_holds_from_the_start(scene: Scene) -> None:
 
 def test_models_are_not_overwritten_and_resume_wants_the_same_config(scene: Scene, uninterrupted: Path) -> None:
     kept = ply(uninterrupted)
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="already holds a model: replace it, continue it or choose another folder"):
         train(scene, CONFIG, output=uninterrupted)
     with pytest.raises(InputError, match="seed=3"):
         train(scene, replace(CONFIG, seed=3), output=uninterrupted, resume=True)
