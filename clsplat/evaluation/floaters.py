@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import activity
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
@@ -85,7 +86,8 @@ def measure_floaters(
     """
     train_psnr = mean_psnr(renderer, splats, evenly(views, _PSNR_VIEWS), background, protocol)
     seen, near, total = np.zeros(len(splats), np.int64), 0.0, 0.0
-    for found in contributions(renderer, splats, views, _LONGEST):
+    for number, found in enumerate(contributions(renderer, splats, views, _LONGEST), 1):
+        activity.report(f"floaters measured in photo {number} of {len(views)}")
         seen += found.weight > 0
         near += float(found.weight[is_near(found)].sum())
         total += float(found.weight.sum())

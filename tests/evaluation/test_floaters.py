@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import MakeRenderer
 
+from clsplat import activity
 from clsplat.device.device import Device
 from clsplat.errors import InputError
 from clsplat.evaluation.contributions import contributions
@@ -59,6 +60,17 @@ def test_weights_of_a_view_sum_to_its_opacity(renderer: Renderer, splats: Splats
         alpha = renderer.render(splats, view.camera).alpha
         assert found.weight.sum() == pytest.approx(alpha.sum(), rel=1e-3)
         assert found.weight.min() >= 0
+
+
+def test_every_photo_is_reported(renderer: Renderer, splats: Splats, scene: Scene) -> None:
+    """A display would repeat what it had before, for minutes."""
+    told: list[str] = []
+    with activity.listening(told.append):
+        measure_floaters(renderer, splats, scene.train)
+    n = len(scene.train)
+    assert [text for text in told if "floaters" in text] == [
+        f"floaters measured in photo {number} of {n}" for number in range(1, n + 1)
+    ]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
