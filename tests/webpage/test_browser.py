@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -199,16 +199,24 @@ def test_the_wheel_comes_closer_and_the_right_button_moves_sideways(page: Page) 
     np.testing.assert_allclose(target(page) - middle, aside - closer, atol=1e-6)
 
 
+def wait_until(page: Page, done: Callable[[], bool]) -> None:
+    """Wait for a key that is held to take effect. A busy machine draws the first frame late."""
+    for _ in range(100):
+        page.wait_for_timeout(100)
+        if done():
+            return
+
+
 def test_keys_fly_and_look(page: Page) -> None:
     before, axes = pose(page)
     page.locator("#view").focus()
     page.keyboard.down("w")
-    page.wait_for_timeout(300)
+    wait_until(page, lambda: (pose(page)[0] - before) @ axes[2] > 0.05)
     page.keyboard.up("w")
     ahead, _ = pose(page)
     assert (ahead - before) @ axes[2] > 0.05
     page.keyboard.down("ArrowRight")
-    page.wait_for_timeout(300)
+    wait_until(page, lambda: pose(page)[1][2] @ axes[0] > 0.05)
     page.keyboard.up("ArrowRight")
     still, turned = pose(page)
     np.testing.assert_allclose(still, ahead, atol=1e-6)
