@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from clsplat.device.specs import count_devices
-from clsplat.errors import InputError, OutputError
+from clsplat.errors import InputError
 from clsplat.files.real_path import real_path
 from clsplat.files.stop_signals import exit_code
 from clsplat.models.resume import find_unfinished
@@ -247,9 +247,8 @@ def train(
         options, reading = stored.run.options | options, stored.run.scene | reading
         recorded, photos = stored.run.scene_path, stored.run.scene["photos"]
         path, search, blocks = path or existing_scene(recorded, model_path), search or stored.search, stored.blocks
-    elif ModelFolder(model_path).is_used and not overwrite:
-        # The function train checks this too, but only after the scene is read.
-        raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
+    else:
+        ModelFolder(model_path).refuse_model(overwrite)  # the function train does so only after the scene is read
     assert path is not None
     config = TrainConfig(**options)
     blocks = blocks_for(config) if blocks_for is not None else blocks

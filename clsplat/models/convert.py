@@ -212,17 +212,14 @@ def _costs(
     named = _cameras(source, cameras)
     if not named or not written:
         return []
-    renderer = Renderer(device)
-    found = []
-    for splats in written:
-        values = []
-        for entry in named:  # one image of each at a time: those of all cameras may be larger than memory
-            before, after = (
-                renderer.render(one, entry.camera, source.background).color for one in (source.splats, splats)
-            )
-            values.append(min(psnr(before, after), MAX_PSNR))
-        found.append(ConversionCost(sum(values) / len(values), min(values), len(values)))
-    return found
+    renderer = Renderer(device, keep=1 + len(written))
+    values: list[list[float]] = [[] for _ in written]
+    for entry in named:  # one camera at a time: the images of all may be larger than memory
+        before = renderer.render(source.splats, entry.camera, source.background).color
+        for splats, of_file in zip(written, values, strict=True):
+            after = renderer.render(splats, entry.camera, source.background).color
+            of_file.append(min(psnr(before, after), MAX_PSNR))
+    return [ConversionCost(sum(each) / len(each), min(each), len(each)) for each in values]
 
 
 def _cameras(source: LoadedModel, path: Path | None) -> list[NamedCamera]:

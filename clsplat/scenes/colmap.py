@@ -19,7 +19,7 @@ from .colmap_binary import check_binary_model, count_registered
 from .colmap_copies import complete_model, without_observations
 from .colmap_faults import image_fault, text_fault
 from .colmap_folder import colmap_folder, model_suffix, models_in
-from .colmap_text import names_with_spaces
+from .colmap_text import names_with_spaces, read_image_lines
 from .scene_files import OTHER_KINDS
 from .undistort import RegisteredImage, colmap_library
 
@@ -132,11 +132,13 @@ def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str], dict[int, set[i
         raise InputError(f"{folder}: cameras or images file is missing (.bin or .txt)")
     if suffix == ".bin":
         check_binary_model(folder)
-    elif (fault := image_fault(folder / f"images{suffix}")) is not None:
-        raise InputError(fault)
     pycolmap = colmap_library()
     tracks: dict[int, set[int]] = {}
     try:
+        images = folder / "images.txt"
+        poses = [image.pose for image in read_image_lines(images, "replace")] if suffix == ".txt" else []
+        if (fault := image_fault(images, poses)) is not None:
+            raise InputError(fault)
         with complete_model(folder, suffix) as whole:
             try:
                 reconstruction = pycolmap.Reconstruction(str(whole))
@@ -153,7 +155,7 @@ def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str], dict[int, set[i
                     "out",
                     stacklevel=5,
                 )
-            yield reconstruction, names_with_spaces(whole / "images.txt") if suffix == ".txt" else {}, tracks
+            yield reconstruction, names_with_spaces(poses), tracks
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
         if suffix == ".txt" and (fault := text_fault(folder)) is not None:
             raise InputError(fault) from None

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from .colmap_text import POINT_WORDS, POSE_WORDS, is_number, read_image_lines
+from .colmap_text import POINT_WORDS, POSE_WORDS, is_number
 from .undistort import colmap_library
 
 _REMEDY = "correct it, or write the model again"
@@ -19,13 +19,13 @@ def text_fault(folder: Path) -> str | None:
     return _fault_of_cameras(folder / "cameras.txt") or _fault_of_points(folder / "points3D.txt")
 
 
-def image_fault(file: Path) -> str | None:
-    """Return what is wrong in images.txt; None if every image has a pose, a camera and a name."""
-    for image in read_image_lines(file, "replace"):
-        words = image.pose.split()
+def image_fault(file: Path, poses: Iterable[str]) -> str | None:
+    """Return what is wrong in images.txt, given its lines with poses; None if all have a pose, a camera and a name."""
+    for pose in poses:
+        words = pose.split()
         whole = (words[0], words[POSE_WORDS - 2]) if len(words) >= POSE_WORDS else ()
         if not whole or not all(map(_is_whole, whole)) or not all(map(is_number, words[: POSE_WORDS - 1])):
-            start = image.pose[:40] + ("..." if len(image.pose) > 40 else "")
+            start = pose[:40] + ("..." if len(pose) > 40 else "")
             return f"{file}: {start!r} is no image (ID QW QX QY QZ TX TY TZ CAMERA NAME): {_REMEDY}"
     return None
 

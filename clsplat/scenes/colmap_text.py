@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,14 +49,14 @@ def with_observation_lines(images: Path) -> bytes | None:
     return text.encode("utf-8", "surrogateescape")
 
 
-def names_with_spaces(images: Path) -> dict[int, str]:
-    """Return the names with spaces in images.txt, by image id.
+def names_with_spaces(poses: Iterable[str]) -> dict[int, str]:
+    """Return the names with spaces in the lines of images.txt that have poses, by image id.
 
     COLMAP ends a name at the first space, but other programs write whole names.
     """
     names = {}
-    for image in read_image_lines(images, "replace"):
-        words = image.pose.split(maxsplit=POSE_WORDS - 1)
+    for pose in poses:
+        words = pose.split(maxsplit=POSE_WORDS - 1)
         if len(words) == POSE_WORDS and words[0].isdecimal() and len(words[-1].split()) > 1:
             names[int(words[0])] = words[-1]
     return names

@@ -61,8 +61,8 @@ def _photos_above(path: Path, scene: str) -> str:
 
 def model_below(path: Path) -> str | None:
     """Return a message on a COLMAP model in a subfolder of a folder of photos; None without one."""
-    for folder in _folders_below(path):
-        alone = is_posed(folder) and not described_by(folder) and not (folder / PHOTOS).is_dir()
+    for folder, posed in _folders_below(path):
+        alone = posed and not described_by(folder) and not (folder / PHOTOS).is_dir()
         if model_suffix(folder) or alone:
             place = folder.relative_to(path)
             photos = "/".join([".."] * len(place.parts) + _photo_folders(path)[:1])
@@ -79,7 +79,7 @@ def _photo_folders(path: Path) -> list[str]:
 
 def other_poses(path: Path) -> str | None:
     """Return a message on the reconstruction of another program in a folder of photos; None without one."""
-    for folder in (path, *_folders_below(path)):
+    for folder in (path, *(folder for folder, _ in _folders_below(path))):
         for file in sorted(folder.glob("*.*")):
             if of_other_program(file):
                 return f"{file}: {describe_file(file)}"
@@ -125,11 +125,11 @@ def scene_above(path: Path) -> Path | None:
 
 def scenes_below(path: Path) -> list[str]:
     """Return the scenes in the subfolders of a folder, as paths relative to it."""
-    return [folder.relative_to(path).as_posix() for folder in _folders_below(path) if is_posed(folder)]
+    return [folder.relative_to(path).as_posix() for folder, posed in _folders_below(path) if posed]
 
 
-def _folders_below(path: Path) -> Iterator[Path]:
-    """Yield the folders below a folder, some levels down, but none inside a scene."""
+def _folders_below(path: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield the folders below a folder, and whether each has poses: some levels down, but none inside a scene."""
     looked = 0
     for folder, folders, _ in os.walk(path):
         kept = []
@@ -137,8 +137,9 @@ def _folders_below(path: Path) -> Iterator[Path]:
             looked += 1
             if name.startswith(".") or looked > _MAX_FOLDERS:
                 continue
-            yield Path(folder) / name
-            if not is_posed(Path(folder) / name):
+            posed = is_posed(Path(folder) / name)
+            yield Path(folder) / name, posed
+            if not posed:
                 kept.append(name)
         folders[:] = kept if len(Path(folder).relative_to(path).parts) + 1 < _LEVELS_DOWN else []
 

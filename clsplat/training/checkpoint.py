@@ -157,10 +157,8 @@ class Checkpoint:
         for group in (self.splats, self.optimizer, self.average, {_STATISTICS: self.statistics}):
             if not all(values.dtype.kind in "fiu" and values.ndim for values in group.values()):
                 raise ValueError("it holds something that is not an array of numbers")
-        if any(len(values) != n for values in self.splats.values()) or self.statistics.shape != (
-            SplatStatistics.ROWS,
-            n,
-        ):
+        expected = (SplatStatistics.ROWS, n)
+        if any(len(values) != n for values in self.splats.values()) or self.statistics.shape != expected:
             raise ValueError("its arrays are not of the same splats")
         if self.average:
             shapes = {name: values.shape for name, values in self.average.items() if name != "count"}

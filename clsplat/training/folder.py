@@ -128,13 +128,14 @@ class ModelFolder:
         if resume and not self.path.is_dir():
             yield
             return
-        self._refuse_model(resume or overwrite)
+        self.refuse_model(resume or overwrite)
         self.prepare()
         with folder_lock(self.path):
-            self._refuse_model(resume or overwrite)  # another run may have ended since
+            self.refuse_model(resume or overwrite)  # another run may have ended since
             yield
 
-    def _refuse_model(self, allowed: bool) -> None:
+    def refuse_model(self, allowed: bool) -> None:
+        """Raise OutputError if the folder holds a model, or a part of one, unless the caller may change it."""
         if self.is_used and not allowed:
             raise OutputError(
                 f"{self.path}: already holds a model",

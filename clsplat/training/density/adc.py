@@ -150,9 +150,8 @@ def _above_threshold(
     with np.errstate(over="ignore"):  # a threshold may be too large for float32: nothing exceeds it
         depth = stats[SplatStatistics.DEPTH_GRADIENT]
         deep = depth * extent > 0.5 * depth_threshold * times if depth_threshold > 0 else None
-        loud = stats[SplatStatistics.SCREEN_GRADIENT] > np.multiply(
-            times, 0.5 * grad_threshold, out=times
-        )  # faster than new memory
+        threshold = np.multiply(times, 0.5 * grad_threshold, out=times)  # faster than new memory
+        loud = stats[SplatStatistics.SCREEN_GRADIENT] > threshold
         if deep is not None:
             loud |= deep
     rows = np.flatnonzero(loud)  # only these can exceed a threshold: few, so they may be in double precision
