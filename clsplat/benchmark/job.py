@@ -1,4 +1,4 @@
-"""A run of a benchmark, for this process or for a worker."""
+"""A run of a benchmark as a job of a worker."""
 
 from __future__ import annotations
 
@@ -11,39 +11,41 @@ from ..comparison.table import Record
 from ..device.device import open_device
 from ..evaluation.perceptual import Lpips
 from ..scenes.scene import Scene
-from ..splats.color import Color
+from ..scenes.source import SceneSource
 from ..training.config import TrainConfig
 from .measure import train_and_measure_in
-from .protocol import BenchmarkScene
+from .protocol import with_photos
 from .sets import StartCube
 from .start import with_start
 
 
 @dataclass(frozen=True)
 class BenchmarkJob:
-    """What is needed to do a run of a benchmark. It can be pickled.
+    """What a worker needs to do a run of a benchmark.
 
     Attributes
     ----------
-    scene : with its protocol. config : options of the run. folder : absolute path of the model.
+    source : of the scene with all training views. photos : training views that are used; None for all.
+    config : options of the run. folder : absolute path of the model.
     start : of published systems in scenes without points. lpips : whether to measure LPIPS.
     """
 
-    scene: BenchmarkScene
+    source: SceneSource
+    photos: int | None
     config: TrainConfig
     folder: Path
     start: StartCube | None
     lpips: bool
 
     def load(self) -> Scene:
-        """Return the scene with the points that the run starts from."""
-        scene = scene_of((self.scene, self.config.background), _load)
-        return scene if self.start is None else with_start(scene, self.start, self.config.seed)
+        """Return the scene with the points that the run starts from. Errors are those of `scene_of`."""
+        scene = scene_of((self.source, self.photos), _load)
+        return with_start(scene, self.start, self.config.seed)
 
 
-def _load(source: tuple[BenchmarkScene, Color]) -> Scene:
-    scene, background = source
-    return scene.load(background)
+def _load(source: tuple[SceneSource, int | None]) -> Scene:
+    scene, photos = source
+    return with_photos(scene.load(), photos)
 
 
 def metric_of(lpips: bool) -> Lpips | None:

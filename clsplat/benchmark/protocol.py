@@ -47,6 +47,10 @@ class BenchmarkScene:
 
     def load(self, background: Color) -> Scene:
         """Return the scene with its test views. Errors and warnings are those of `load_scene` and `few_photos`."""
+        return with_photos(self.load_all(background), self.photos)
+
+    def load_all(self, background: Color) -> Scene:
+        """Return the scene with all of its training views."""
         loaded = load_scene(
             _source(self.path, self.images),
             self.images,
@@ -55,8 +59,12 @@ class BenchmarkScene:
             background=background,
             masks=NO_MASKS,  # the protocols measure all pixels, even if there is a folder of masks
         )
-        loaded = replace(loaded, name=self.scene.name)
-        return loaded if self.photos is None else few_photos(loaded, self.photos)
+        return replace(loaded, name=self.scene.name)
+
+
+def with_photos(scene: Scene, photos: int | None) -> Scene:
+    """Return a scene with this number of training views; None for all."""
+    return scene if photos is None else few_photos(scene, photos)
 
 
 def find_scenes(

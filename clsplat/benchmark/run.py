@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 from ..cluster.job import Job
+from ..cluster.training import scene_of
 from ..comparison.methods import Method, parse_methods
 from ..comparison.planned import PlannedRun, do_runs
 from ..comparison.runs import Run, RunFile, key_digest, refuse_foreign
@@ -17,6 +18,9 @@ from ..device.device import open_device
 from ..evaluation.perceptual import Lpips
 from ..files.lock import folder_lock
 from ..files.real_path import real_path
+from ..scenes.scene import Scene
+from ..scenes.source import SceneSource
+from ..splats.color import Color
 from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.presets import PRESETS
@@ -24,7 +28,8 @@ from .job import BenchmarkJob, do_benchmark_run, metric_of
 from .measure import train_and_measure_in
 from .protocol import BenchmarkScene, find_scenes
 from .results import files_of_results, write_results
-from .sets import BenchmarkSet, benchmark_set
+from .sets import BenchmarkSet, StartCube, benchmark_set
+from .start import with_start
 
 MODELS = "models"
 
@@ -114,6 +119,7 @@ def _missing(
     progress: Callable[[Progress], None] | None,
 ) -> Iterator[PlannedRun]:
     """Yield the runs on a scene that are not finished. configs : of all runs. place : folder of the benchmark."""
+    source = cache(partial(_source_of, scene))
     for number, (method, config) in enumerate(configs, 1):
         label = method.label
         done = runs.find(_identity(chosen, scene), label, config)
@@ -129,18 +135,47 @@ def _missing(
         }
         model = place / MODELS / f"{scene.scene.name}-{run.stem}-{key_digest(record)}"
         start = chosen.start if method.base in PRESETS else None
-        job = BenchmarkJob(scene, config, real_path(model), start, metric is not None)
         yield PlannedRun(
             run,
             record,
-            partial(_alone, job, model, metric, progress),
-            partial(Job, f"{run.scene} {run.stem}", do_benchmark_run, (job,)),
+            partial(_alone, scene, config, model, start, metric, progress),
+            partial(_job, source, scene.photos, run, model, start, metric is not None),
         )
 
 
-def _alone(job: BenchmarkJob, model: Path, metric: Lpips | None, progress: Callable[[Progress], None] | None) -> Record:
-    """Do a run in this process. model : its folder as messages name it."""
-    return train_and_measure_in(model, job.load(), job.config, open_device(job.config.device), metric, progress)
+def _alone(
+    scene: BenchmarkScene,
+    config: TrainConfig,
+    model: Path,
+    start: StartCube | None,
+    metric: Lpips | None,
+    progress: Callable[[Progress], None] | None,
+) -> Record:
+    """Do a run in this process. model : its folder."""
+    loaded = with_start(scene_of((scene, config.background), _load), start, config.seed)
+    return train_and_measure_in(model, loaded, config, open_device(config.device), metric, progress)
+
+
+def _load(source: tuple[BenchmarkScene, Color]) -> Scene:
+    scene, background = source
+    return scene.load(background)
+
+
+def _job(
+    source: Callable[[Color], SceneSource],
+    photos: int | None,
+    run: Run,
+    model: Path,
+    start: StartCube | None,
+    lpips: bool,
+) -> Job:
+    """Return the job that has a worker do a run. source : of the scene with a background, from the program's files."""
+    work = BenchmarkJob(source(run.config.background), photos, run.config, real_path(model), start, lpips)
+    return Job(f"{run.scene} {run.stem}", do_benchmark_run, (work,))
+
+
+def _source_of(scene: BenchmarkScene, background: Color) -> SceneSource:
+    return SceneSource.of(scene.load_all(background))
 
 
 def _runs(

@@ -12,16 +12,16 @@ from .sets import StartCube
 GREY = 128  # 3DGS's code: the SH coefficients are at most 1/255
 
 
-def with_start(scene: Scene, start: StartCube, seed: int) -> Scene:
+def with_start(scene: Scene, start: StartCube | None, seed: int) -> Scene:
     """Return a scene with random grey points in a cube, as published systems start (3DGS, code).
 
     Parameters
     ----------
     scene : a scene without points; others stay as they are.
-    start : number of points and side of the cube.
+    start : number of points and side of the cube; None to change nothing.
     seed : seed of the points.
     """
-    if len(scene.points):
+    if start is None or len(scene.points):
         return scene
     half = 0.5 * start.side
     xyz = np.random.default_rng(seed).uniform(-half, half, (start.points, 3))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, suppress
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 from .. import activity
 from .._version import __version__
@@ -20,6 +20,8 @@ from .address import ClusterAddress
 from .dask import distributed, scheduler_address
 from .job import RESOURCE, Job, Outcome, perform
 from .workers import CONNECT_SECONDS, POLL, check_scheduler, local_cluster, no_scheduler, plan_workers
+
+T = TypeVar("T")
 
 MOST_DEATHS = 5  # times that Dask may give up a job because its workers died; Dask itself tries four workers each time
 SAVING_SECONDS = 60.0  # that jobs get to save their work after Ctrl-C
@@ -84,7 +86,8 @@ class WorkerPool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with suppress(OSError, TimeoutError):
+        # Dask raises RuntimeError if the scheduler ends at the same moment.
+        with suppress(OSError, TimeoutError, RuntimeError):
             self._open.close()
         self._client = None
 
@@ -179,22 +182,28 @@ class _Round:
             for future in [future for future in self.futures if future.done() and future.status != "lost"]:
                 number = self.futures.pop(future)
                 found = self._collect(future, number)
+                if future not in self.futures:
+                    future.release()  # if the worker that has the result dies, the scheduler would have it made again
                 if found is not None:
                     self.done += 1
                     self.shares.pop(number, None)
                     yield number, found.error or found.value
 
     def end(self) -> None:
-        """Cancel the jobs that are left, and wait until they have saved their work."""
-        if self.futures and self.client.status == "running":
-            with suppress(Exception):
-                self.client.cancel(list(self.futures), asynchronous=False)
-            give_up = time.monotonic() + SAVING_SECONDS
-            while (saving := self._running()) and time.monotonic() < give_up:
-                activity.report(f"{_number(len(saving), 'run')} saving the work so far")
-                time.sleep(0.1)
+        """Give up the jobs that are left, and wait until they have saved their work."""
         with suppress(Exception):
+            if self.futures and self.client.status == "running":
+                for future in self.futures:
+                    future.release()
+                self._wait_for_saving()
             self.client.unsubscribe_topic(self.topic)
+
+    def _wait_for_saving(self) -> None:
+        """Wait until no job runs any more. Raise TimeoutError if the scheduler does not answer."""
+        give_up = time.monotonic() + SAVING_SECONDS
+        while (saving := _in_time(self._running)) and time.monotonic() < give_up:
+            activity.report(f"{_number(len(saving), 'run')} saving the work so far")
+            time.sleep(0.1)
 
     def _running(self) -> list[int]:
         """Return the numbers of the jobs that a worker does at present."""
@@ -238,7 +247,7 @@ class _Round:
             if not others and now - self.gone.setdefault(future, now) < GONE_SECONDS:
                 continue
             del self.pinned[future], self.futures[future]
-            self.client.cancel([future], asynchronous=False)
+            future.release()
             if others:
                 self._submit(number, others)
             else:
@@ -318,6 +327,22 @@ class _Round:
         if not running and not _workers(self.client):
             texts = [f"waiting for workers: clsplat worker {self.place}"]
         activity.report(f"{self.done} of {len(self.jobs)} runs done{'; ' if texts else ''}{', '.join(texts)}")
+
+
+def _in_time(call: Callable[[], T]) -> T:
+    """Return the result of a call that asks the scheduler. Raise TimeoutError if it does not answer."""
+    found: list[T] = []
+
+    def ask() -> None:
+        with suppress(Exception):
+            found.append(call())
+
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(CONNECT_SECONDS)
+    if not found:
+        raise TimeoutError
+    return found[0]
 
 
 def _workers(client: Any) -> dict[str, str]:

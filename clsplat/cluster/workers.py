@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import multiprocessing
 import os
 import platform
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
+from multiprocessing import resource_tracker
 from typing import Any
 
 from ..device.device import DeviceInfo, list_devices, open_device
 from ..errors import ClusterError, InputError, Remedy
+from ..files.stop_signals import STOP_SIGNALS
 from ..rendering.tuning import SCHEDULE_VARIABLE, schedule_for
 from .dask import distributed
 from .job import DEVICE_VARIABLE, RESOURCE
@@ -24,8 +28,8 @@ CORES_OF_A_WORKER = 2  # on a CPU, unless the number of workers is given
 CONNECT_SECONDS = 10.0
 POLL = 0.5  # seconds
 MOST_STARTS = 20  # of a process that dies each time
-# These run first in a worker's process. Ctrl-C reaches all processes of a terminal, and the program that started this
-# one ends it. Threads inherit the cores of the thread that starts them, so all later ones have them.
+# These run first in a worker's process, after its imports. Where signals cannot be blocked, Ctrl-C is ignored only now.
+# Threads inherit the cores of the thread that starts them, so all later ones have them.
 _IGNORE_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 _SET_CORES = "import os; getattr(os, 'sched_setaffinity', lambda *_: None)(0, {cores})"
 
@@ -122,6 +126,7 @@ def local_cluster(plans: Sequence[WorkerPlan]) -> Iterator[Any]:
         n_workers=0, host=address, scheduler_port=0, dashboard_address=f"{address}:0", silence_logs="critical"
     ) as cluster:
         loop = cluster.loop.asyncio_loop
+        loop.call_soon_threadsafe(_keep_signals_from_children)
         ready = [threading.Event() for _ in plans]
         workers = [
             asyncio.run_coroutine_threadsafe(_keep(cluster.scheduler_address, plan, event.set), loop)
@@ -137,13 +142,34 @@ def local_cluster(plans: Sequence[WorkerPlan]) -> Iterator[Any]:
         finally:
             for worker in workers:
                 worker.cancel()
-            asyncio.run_coroutine_threadsafe(_until_closed(), loop).result(CONNECT_SECONDS)
+            with suppress(TimeoutError):
+                asyncio.run_coroutine_threadsafe(_until_closed(), loop).result(2 * CONNECT_SECONDS)
+            _end_the_rest()
+
+
+def _keep_signals_from_children() -> None:
+    """Block stop signals in this thread, so in the processes that it starts. Windows cannot do this.
+
+    A terminal sends Ctrl-C to all of its processes, and service managers do so with SIGTERM. The program ends its
+    workers itself, after they have saved their work.
+    """
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+        resource_tracker.ensure_running()  # the first process would start it, and it unblocks signals in this thread
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
 
 
 async def _until_closed() -> None:
     """Wait until the workers of this loop have ended."""
     while _open:
         await asyncio.sleep(0.05)
+
+
+def _end_the_rest() -> None:
+    """Kill worker processes that have not ended. Python would wait for them at its exit, after a signal they block."""
+    for process in multiprocessing.active_children():
+        if "from Nanny" in process.name:
+            process.kill()
 
 
 _open: set[Any] = set()  # nannies of this process
@@ -172,12 +198,14 @@ async def _keep(address: str, plan: WorkerPlan, on_ready: Callable[[], None]) ->
         name = f"{plan.name}.{attempt}" if attempt else plan.name  # the scheduler may still know the other one
         nanny = package.Nanny(address, **plan.options() | {"name": name})
         _open.add(nanny)
+        start = asyncio.ensure_future(nanny)
         try:
             with suppress(OSError, RuntimeError, TimeoutError):
-                await nanny
+                await asyncio.shield(start)
                 started()
                 await nanny.finished()
         finally:
+            await asyncio.wait([start], timeout=CONNECT_SECONDS)  # a process that is left while it starts goes on
             with suppress(Exception):  # the scheduler may be gone
                 await nanny.close(timeout=CONNECT_SECONDS)
             _open.discard(nanny)
@@ -231,12 +259,26 @@ def serve(address: str, plans: Sequence[WorkerPlan], on_ready: Callable[[WorkerP
         if on_ready is not None:
             on_ready(plan)
 
+    begun: list[tuple[asyncio.AbstractEventLoop, asyncio.Task[None] | None]] = []
+
     async def run() -> None:
+        begun.append((asyncio.get_running_loop(), asyncio.current_task()))
         if not await _answers_in_time(address):
             raise no_scheduler(address)
         await asyncio.gather(*(_keep(address, plan, partial(ready, plan)) for plan in plans))
 
-    asyncio.run(run())
+    with ThreadPoolExecutor(1, initializer=_keep_signals_from_children) as thread:
+        end = thread.submit(asyncio.run, run())
+        try:
+            while not wait([end], POLL).done:
+                pass
+        finally:
+            for loop, task in begun:
+                if task is not None and not end.done():
+                    loop.call_soon_threadsafe(task.cancel)
+            wait([end])
+            _end_the_rest()
+        end.result()
 
 
 def no_scheduler(address: str) -> ClusterError:

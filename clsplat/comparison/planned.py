@@ -62,6 +62,10 @@ def do_runs(
         if on_run is not None:
             on_run(planned.run, record)
 
+    def remove_scratch(planned: PlannedRun) -> None:
+        if planned.scratch is not None:
+            shutil.rmtree(planned.scratch, ignore_errors=True)
+
     def add(planned: PlannedRun, measured: Record) -> None:
         record = planned.record | measured | dict(extra or {})
         runs.add(record)
@@ -75,13 +79,15 @@ def do_runs(
     plan = list(plan)
     if not plan:
         return
-    place = marked(place)
+    place, finished = marked(place), []
     try:
         with WorkerPool(cluster, plan[0].run.config.device) as pool:
             for number, measured in pool.successes([each.job() for each in plan], lambda at: tell(plan[at])):
                 add(plan[number], measured)
-                if (scratch := plan[number].scratch) is not None:
-                    shutil.rmtree(scratch, ignore_errors=True)
+                finished.append(plan[number])
+                remove_scratch(plan[number])
     finally:
+        for planned in finished:  # once more: a worker that the scheduler had lost may have written into it
+            remove_scratch(planned)
         unmark(place)
         runs.arrange([planned.record for planned in plan])  # workers end in any order

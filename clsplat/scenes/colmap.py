@@ -46,6 +46,9 @@ class Points:
         return len(self.xyz)
 
 
+NO_POINTS = Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.int64))
+
+
 @dataclass(frozen=True, eq=False)
 class SparseReconstruction:
     """A COLMAP model: registered photos sorted by name, and points."""

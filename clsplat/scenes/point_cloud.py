@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..files.atomic import atomic_writer
 from ..splats.formats.ply_body import read_body
 from ..splats.formats.ply_header import read_header
-from .colmap import Points
+from .colmap import NO_POINTS, Points
 
 GREY = 128  # colour of points in files without colours
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
@@ -83,8 +83,7 @@ def write_point_cloud(path: str | os.PathLike[str], points: Points) -> None:
 
 def join_points(clouds: Sequence[Points]) -> Points:
     """Return several clouds as one; no cloud gives one without points."""
-    nothing = Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.int64))
-    parts = [nothing, *clouds]
+    parts = [NO_POINTS, *clouds]
     return Points(
         np.concatenate([part.xyz for part in parts]),
         np.concatenate([part.rgb for part in parts]),

@@ -13,7 +13,7 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.seen import sampled, seen
 from ..errors import InputError
-from .colmap import Points
+from .colmap import NO_POINTS, Points
 from .extent import together
 from .origin import FAR
 from .posed_images import PosedImages
@@ -78,7 +78,7 @@ def without_unseen_points(root: Path, points: Points, cameras: Sequence[Camera])
         "they are left out",
         stacklevel=3,
     )
-    return Points(points.xyz[:0], points.rgb[:0], points.track_length[:0])
+    return NO_POINTS
 
 
 def warn_of_lone_cameras(root: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:

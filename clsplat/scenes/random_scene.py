@@ -12,7 +12,7 @@ from ..files.images import ImageU8
 from ..splats.fields import Array, Field, public_shape, sh_coefficients
 from ..splats.shapes import DEFAULT_SHAPE, Shape, shape_named
 from ..splats.splats import Splats
-from .colmap import Points
+from .colmap import NO_POINTS
 from .demo.scene import RING_RADIUS, RING_TARGET, ring_cameras
 from .scene import Scene, View
 
@@ -63,8 +63,7 @@ def synthetic_scene(
         View(f"view_{index:03d}.png", camera, _smooth_image(width, height, rng))
         for index, camera in enumerate(ring_cameras(width, height, n_views))
     ]
-    points = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
-    return Scene("synthetic", Path("synthetic"), views, points), splats
+    return Scene("synthetic", Path("synthetic"), views, NO_POINTS), splats
 
 
 def _splats(n: int, shape: Shape, sh_degree: int, rng: np.random.Generator) -> Splats:

@@ -10,6 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..files.real_path import real_path
 from ..splats.color import Color
+from .colmap import NO_POINTS
 from .options import READING_OPTIONS
 from .scene import Scene, load_scene
 
@@ -24,7 +25,7 @@ class SceneSource:
     reading : arguments of `load_scene`.
     names : names of all views.
     photo_digests : as of `Scene`.
-    points_digest : digest of the points.
+    points_digest : digest of the points; None without points, which may be in the files but do not fit the poses.
     """
 
     name: str
@@ -35,7 +36,7 @@ class SceneSource:
     test_names: frozenset[str]
     validation_names: frozenset[str]
     photo_digests: Mapping[str, str]
-    points_digest: str
+    points_digest: str | None
 
     @classmethod
     def of(cls, scene: Scene) -> SceneSource:
@@ -67,7 +68,9 @@ class SceneSource:
         changed = [name for name in self.names if loaded.photo_digests.get(name) != self.photo_digests.get(name)]
         if changed:
             raise InputError(f"{self.path}: the photo {changed[0]} is another one here: copy the scene's files again")
-        if _points_digest(loaded) != self.points_digest:
+        if self.points_digest is None:
+            loaded = replace(loaded, points=NO_POINTS)
+        elif _points_digest(loaded) != self.points_digest:
             raise InputError(
                 f"{self.path}: the points are others here than in the program that asks: copy the scene's files again, "
                 "and do not change a scene between reading and training"
@@ -94,7 +97,9 @@ class SceneSource:
         )
 
 
-def _points_digest(scene: Scene) -> str:
+def _points_digest(scene: Scene) -> str | None:
+    if not len(scene.points):
+        return None
     result = hashlib.sha256(scene.points.xyz.tobytes())
     result.update(scene.points.rgb.tobytes())
     return result.hexdigest()

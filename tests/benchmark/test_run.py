@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import pickle
+import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +18,15 @@ from clsplat.benchmark.results import result_notes, result_rows, result_tables
 from clsplat.benchmark.run import run_benchmark
 from clsplat.benchmark.sets import StartCube, benchmark_set
 from clsplat.benchmark.start import with_start
+from clsplat.cluster.job import Job, MissingFiles
 from clsplat.comparison import measure
+from clsplat.comparison.planned import PlannedRun
 from clsplat.comparison.runs import Run
 from clsplat.comparison.table import Record
 from clsplat.errors import InputError, OutputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.evaluation.metrics import PROTOCOLS
+from clsplat.files.images import write_png
 from clsplat.files.stop_signals import forget
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Points, Scene, load_scene
@@ -177,6 +183,37 @@ def test_workers_write_the_files_of_a_benchmark_without_them(tanks: Path, finish
         assert {key: row[key] for key in kept} == {key: other[key] for key in kept}
     files = {path.relative_to(finished) for path in finished.rglob("*")}
     assert {path.relative_to(tmp_path) for path in tmp_path.rglob("*")} == files
+
+
+def test_a_worker_trains_on_the_photos_and_points_of_the_program(
+    tanks: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker on another machine reads the scene by its absolute path, and refuses other files there."""
+    shutil.copytree(tanks / "truck", tmp_path / "here" / "truck")
+    monkeypatch.chdir(tmp_path)
+    jobs: list[Job] = []
+
+    def keep(plan: Iterable[PlannedRun], *more: object) -> None:
+        jobs.extend(each.job() for each in plan)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clsplat.benchmark.run.do_runs", keep)
+    for photos in (None, 3):
+        with pytest.raises(KeyboardInterrupt):
+            run_benchmark("tanks", "here", "gaussian", "out", caps=[CAP], common=SHORT, photos=photos)
+    monkeypatch.chdir("/")
+    whole, few = (pickle.loads(pickle.dumps(job)).arguments[0] for job in jobs)
+    assert whole.folder.is_absolute()
+    expected = load_scene(tanks / "truck")
+    assert whole.load().names == expected.names
+    assert (whole.load().points.xyz == expected.points.xyz).all()
+    assert len(few.load().train) == 3
+    assert 0 < len(few.load().points) < len(expected.points)
+    photo = tmp_path / "here" / "truck" / "images" / expected.names[0]
+    write_png(photo, np.zeros(expected.views[0].image.shape, np.uint8))
+    for job in (whole, few):
+        with pytest.raises(MissingFiles, match=f"{photo.name} is another one here"):
+            job.load()
 
 
 def test_other_options_are_another_run(tanks: Path, tmp_path: Path) -> None:

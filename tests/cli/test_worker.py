@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,6 +16,7 @@ from cli_runner import clsplat, error_of, run
 from clsplat.cluster import pool, workers
 
 pytest.importorskip("distributed")
+import psutil  # comes with dask.distributed
 
 
 @pytest.fixture
@@ -67,3 +73,33 @@ def test_frontier_and_benchmark_with_workers(scene: Path, tmp_path: Path) -> Non
     place = tmp_path / "published"
     clsplat("benchmark", "tanks", sets, "-o", place, *TINY, "--cluster", "local:1", "-q")
     assert (place / "tanks.md").is_file()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.5])
+def test_ctrl_c_while_workers_start_is_one_line(scene: Path, tmp_path: Path, seconds: float) -> None:
+    """A terminal sends it to the workers, too. They import for a second before they can ignore it."""
+    arguments = ["compare", scene, "-o", tmp_path / "out", *TINY, "--cluster", "local:1"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from clsplat_cli.start import main; main()", *map(str, arguments)],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    with process:
+        program = psutil.Process(process.pid)
+        while process.poll() is None and not any(map(is_worker, program.children())):
+            time.sleep(0.01)
+        time.sleep(seconds)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.stderr is not None
+        lines = process.stderr.read().decode().splitlines()
+    assert lines[-1:] == ["error: interrupted"]
+    assert not [line for line in lines if "Traceback" in line]
+    assert process.returncode == 130
+
+
+def is_worker(process: psutil.Process) -> bool:
+    """Return whether this is a worker's process, or one that has just begun to be one."""
+    with suppress(psutil.NoSuchProcess):
+        return "spawn_main" in " ".join(process.cmdline())
+    return False

@@ -25,6 +25,7 @@ from clsplat.cluster import workers
 from clsplat.cluster.job import RESOURCE, Job
 from clsplat.cluster.pool import WorkerPool
 from clsplat.errors import ClusterError, InputError
+from clsplat.files.stop_signals import STOP_SIGNALS
 
 pytest.importorskip("distributed")
 PATIENCE = 60.0  # seconds that a slow machine may need
@@ -66,6 +67,11 @@ def test_workers_have_cores_of_their_own(pool: WorkerPool) -> None:
     assert os.getpid() not in cores
 
 
+def test_the_program_alone_ends_its_workers(pool: WorkerPool) -> None:
+    """A signal to a whole group of processes would end a worker before it has saved its work."""
+    assert set(results(pool, Job("blocked", cluster_jobs.blocked))[0]) >= set(STOP_SIGNALS)
+
+
 def test_a_job_whose_worker_dies_is_done_again(pool: WorkerPool, tmp_path: Path) -> None:
     """Dask gives a job up after four deaths of its workers. The pool sends it again."""
     jobs = [Job("dies", cluster_jobs.dies, (tmp_path / str(times), times)) for times in (0, 1, 5)]
@@ -94,16 +100,33 @@ def test_a_result_that_is_lost_while_it_is_fetched_is_made_again(
     assert len(lost) == 1
 
 
-def test_a_worker_that_dies_while_it_starts_is_started_again(pool: WorkerPool) -> None:
-    """Dask gives such a worker up."""
+def test_a_result_that_was_fetched_is_not_made_again(pool: WorkerPool, tmp_path: Path) -> None:
+    """Its worker dies while another job runs. The scheduler would have it made again if somebody still wanted it."""
+    jobs = [Job("first", cluster_jobs.dies, (tmp_path / "tries", 0)), Job("late", cluster_jobs.squared_late, (5,))]
+    found = []
+    for _, value in pool.results(jobs):
+        found.append(value)
+        if len(found) == 1:
+            kill_workers()
+    assert found == [1, 25]
+    assert (tmp_path / "tries").read_text() == "x"
+
+
+def kill_workers() -> None:
+    """Kill the worker processes of this one."""
     import psutil  # comes with dask.distributed
 
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):
+            if "spawn_main" in " ".join(child.cmdline()):
+                child.kill()
+
+
+def test_a_worker_that_dies_while_it_starts_is_started_again(pool: WorkerPool) -> None:
+    """Dask gives such a worker up."""
     until = time.monotonic() + 4
     while time.monotonic() < until:
-        for child in psutil.Process().children():
-            with suppress(psutil.NoSuchProcess):
-                if "spawn_main" in " ".join(child.cmdline()):
-                    child.kill()
+        kill_workers()
         time.sleep(0.2)
     assert results(pool, Job("square", cluster_jobs.squared, (4,))) == [16]
 
@@ -224,6 +247,7 @@ def test_a_job_that_only_a_lost_worker_could_do_is_given_up(monkeypatch: pytest.
         "tcp://2": {"name": "bad", "resources": {RESOURCE: 1}},
     }
     sent: list[Any] = []
+    released: list[Any] = []
 
     class Client:
         status = "running"
@@ -233,10 +257,11 @@ def test_a_job_that_only_a_lost_worker_could_do_is_given_up(monkeypatch: pytest.
 
         def submit(self, *arguments: Any, **named: Any) -> Any:
             sent.append(named["workers"])
-            return Future()
+            return Sent()
 
-        def cancel(self, futures: Any, asynchronous: bool) -> None:
-            pass
+    class Sent(Future[Any]):
+        def release(self) -> None:
+            released.append(self)
 
     jobs = [Job("square", cluster_jobs.squared, (1,))]
     round_ = module._Round(Client(), "address", jobs, None)
@@ -260,6 +285,7 @@ def test_a_job_that_only_a_lost_worker_could_do_is_given_up(monkeypatch: pytest.
     monkeypatch.setattr(module, "GONE_SECONDS", 0.0)
     round_._unpin()
     assert (round_.given_up, round_.futures, round_.pinned) == ([0], {}, {})
+    assert len(released) == 2
 
 
 def test_runs_of_lost_workers_do_not_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -276,6 +302,26 @@ def test_runs_of_lost_workers_do_not_run(monkeypatch: pytest.MonkeyPatch) -> Non
         "0 of 1 runs done; square 0%",
         "0 of 1 runs done; waiting for workers: clsplat worker address",
     ]
+
+
+def test_a_scheduler_that_does_not_answer_cannot_keep_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C ends it, though nobody knows whether the jobs have saved their work."""
+    answer = threading.Event()
+    monkeypatch.setattr(module, "CONNECT_SECONDS", 0.1)
+    client = SimpleNamespace(status="running", scheduler_info=lambda n_workers: answer.wait() and {"workers": {}})
+    round_ = module._Round(client, "address", [Job("square", cluster_jobs.squared, (1,))], None)
+    released: list[object] = []
+
+    class Wanted:
+        def release(self) -> None:
+            released.append(self)
+
+    round_.futures[Wanted()] = 0
+    started = time.monotonic()
+    round_.end()
+    assert time.monotonic() - started < PATIENCE
+    assert len(released) == 1
+    answer.set()
 
 
 def test_a_scheduler_that_ends_is_one_line(tmp_path: Path) -> None:

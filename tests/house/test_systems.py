@@ -64,7 +64,7 @@ WITH_TWIN = {
     "clsplat/files/lock.py": {"fcntl"},  # else msvcrt
     "clsplat/files/host_memory.py": {"resource"},  # else windows.peak_bytes
     "clsplat/files/atomic.py": {"os.kill"},  # else windows.is_running
-    "clsplat/cluster/workers.py": {"os.sched_getaffinity"},  # else all cores
+    "clsplat/cluster/workers.py": {"os.sched_getaffinity", "signal.pthread_sigmask"},  # else all cores; _IGNORE_CTRL_C
     "clsplat/files/stop_signals.py": {"signal.pthread_kill"},  # else _thread.interrupt_main
 }
 # Functions of other libraries that have the name of one that opens text files.

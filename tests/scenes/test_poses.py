@@ -23,6 +23,7 @@ from clsplat.scenes.colmap_binary import write_binary_model
 from clsplat.scenes.origin import camera_centres, size_of
 from clsplat.scenes.posed_images import PosedImages
 from clsplat.scenes.scene import load_scene
+from clsplat.scenes.source import SceneSource
 
 
 @pytest.fixture
@@ -185,7 +186,9 @@ def test_points_that_no_photo_shows_are_left_out(garden: Path) -> None:
     """They are of other poses. Splats that start there would have to be removed first."""
     write_model(garden, moved(), shift=-500.0)
     with pytest.warns(UserWarning, match=r"its photos show 0\.0% of its 12 points, so the points do not fit the poses"):
-        assert len(load_scene(garden).points) == 0
+        scene = load_scene(garden)
+    assert len(scene.points) == 0
+    assert len(SceneSource.of(scene).load().points) == 0, "a worker leaves them out, too"
     write_model(garden, moved())
     with warnings.catch_warnings():
         warnings.simplefilter("error")

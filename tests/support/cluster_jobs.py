@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -20,10 +21,21 @@ def squared(context: JobContext, number: int) -> int:
     return number * number
 
 
+def squared_late(context: JobContext, number: int) -> int:
+    """Return the square of a number, a second later."""
+    time.sleep(20 * STEP)
+    return squared(context, number)
+
+
 def place(context: JobContext) -> tuple[str | None, list[int], int]:
     """Return the device, the cores and the process of the worker."""
     time.sleep(2 * STEP)  # so that the other worker takes the next job
     return context.device, CORES, os.getpid()
+
+
+def blocked(context: JobContext) -> list[int]:
+    """Return the signals that the process does not get."""
+    return sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
 
 
 def dies(context: JobContext, file: Path, times: int) -> int:
