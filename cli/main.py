@@ -6,6 +6,7 @@ import importlib
 import io
 import re
 import sys
+import traceback
 import warnings
 from typing import Any, TextIO
 
@@ -150,6 +151,9 @@ class Commands(click.Group):
         except click.Abort:
             click.echo(f"error: {stop_signals.reason()}", err=True)
             code = stop_signals.exit_code()
+        except OSError as error:  # of the text of --help or --version
+            click.echo(f"error: {_of_system(error)}", err=True)
+            code = 1
         sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -179,7 +183,7 @@ def _known_failure(error: Exception) -> ClsplatError | None:
     if isinstance(error, MemoryError):
         return ClsplatError("out of memory", FEWER_SPLATS, SMALLER_IMAGES, Remedy("close other programs"))
     if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
-        return ClsplatError(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return _of_system(error)
     cl = sys.modules.get("pyopencl")  # if it is not loaded, the error is not from OpenCL
     if cl is None or not isinstance(error, cl.Error):
         return None
@@ -188,6 +192,16 @@ def _known_failure(error: Exception) -> ClsplatError | None:
     if is_out_of_memory(error):
         return ClsplatError("device out of memory", FEWER_SPLATS, SMALLER_IMAGES, OTHER_DEVICE)
     return ClsplatError(f"the OpenCL device failed: {first_line(error)}", Remedy("try `clsplat devices`"), OTHER_DEVICE)
+
+
+def _of_system(error: OSError) -> ClsplatError:
+    """Return the error of clsplat for one of the system."""
+    if error.filename:
+        return ClsplatError(f"{error.filename}: {error.strerror}")
+    *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
+    if innermost.f_code is click.echo.__code__:
+        return ClsplatError(f"standard output: cannot be written ({error.strerror}): send it elsewhere")
+    return ClsplatError(str(error))
 
 
 def _show_warning(

@@ -133,7 +133,7 @@ def _missing(
             "repeat": 0,
             "differences": [*scene.differences, *_differences(chosen, scene, method, config)],
         }
-        model = place / MODELS / f"{scene.scene.name}-{run.stem}-{key_digest(record)}"
+        model = place / MODELS / f"{run.file_name}-{key_digest(record)}"
         start = chosen.start if method.base in PRESETS else None
         yield PlannedRun(
             run,

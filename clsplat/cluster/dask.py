@@ -41,7 +41,8 @@ def scheduler_address(address: ClusterAddress) -> str:
         return address.text if "://" in address.text else f"tcp://{address.text}"
     path = Path(address.text)
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))["address"]
+        # Reading a pipe could wait for ever.
+        found = None if path.is_fifo() else json.loads(path.read_text(encoding="utf-8"))["address"]
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror or error}): "

@@ -130,21 +130,22 @@ def scene_of(source: Any, load: Callable[[Any], Scene]) -> Scene:
 def in_folder(folder: Path, run: Callable[[Path], T], *, keep: bool = False) -> T:
     """Return the result of a run in its folder.
 
-    Without `keep` a temporary folder replaces one that this machine does not see, or that a worker uses which the
-    scheduler has lost.
+    Without `keep` a temporary folder replaces one that this machine does not see or cannot write, or that a worker uses
+    which the scheduler has lost.
 
     Raises
     ------
     Abandoned : nobody waits for the run any more; what it has done so far is saved.
-    MissingFiles : with `keep`, if this machine does not see the folder. OutputError : with `keep`, if it is in use.
+    MissingFiles : with `keep`, if this machine does not see the folder.
+    OutputError : with `keep`, if it is in use or cannot be written.
     """
     with ExitStack() as stack:
         seen = (folder.parent / MARK).is_file()
         if keep and not seen:
             raise MissingFiles(f"{folder.parent}: this machine does not see that folder: write into a shared one")
         if seen:
-            folder.mkdir(exist_ok=True)
             try:
+                _make(folder)
                 stack.enter_context(folder_lock(folder))
             except OutputError:
                 if keep:
@@ -156,6 +157,17 @@ def in_folder(folder: Path, run: Callable[[Path], T], *, keep: bool = False) -> 
             return run(folder)
         except KeyboardInterrupt:
             raise Abandoned from None
+
+
+def _make(folder: Path) -> None:
+    """Make a folder for a run. Raise OutputError if this machine cannot write there."""
+    try:
+        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = error.strerror or error
+        raise OutputError(f"{folder}: cannot be written ({reason}): let the user of this worker write there") from None
 
 
 def marked(place: Path) -> Path:

@@ -121,8 +121,8 @@ def _missing(
                 continue
             run = Run(scene.name, label, config, number, len(configs), again)
             record: Record = {"scene": identity, "system": label, "config": config.to_json(), "repeat": again}
-            ply = folder / MODELS / f"{scene.name}-{run.stem}.ply" if save_models else None
-            scratch = real_path(folder) / UNFINISHED / f"{scene.name}-{run.stem}-{key_digest(record)}"
+            ply = folder / MODELS / f"{run.file_name}.ply" if save_models else None
+            scratch = real_path(folder) / UNFINISHED / f"{run.file_name}-{key_digest(record)}"
             yield PlannedRun(
                 run,
                 record,

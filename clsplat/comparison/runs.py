@@ -12,11 +12,13 @@ from typing import Any
 
 from ..errors import InputError, OutputError
 from ..files.atomic import atomic_writer
+from ..files.file_names import short_name
 from ..scenes.scene import Scene
 from ..training.config import FREE_OPTIONS, TrainConfig
 from .table import MEASURED, Record
 
 RUNS = "runs.jsonl"
+_LONGEST_NAME = 200  # of a run's files, without digits and a suffix [bytes]; most file systems allow 255
 # Keys that every line must have.
 _KEYS = {
     "scene",
@@ -51,8 +53,13 @@ class Run:
         return f"[{self.number}/{self.total}] {self.scene} {self.system} cap {config.cap_max} seed {config.seed}{again}"
 
     @property
+    def file_name(self) -> str:
+        """Name of the run's files, without their suffix: scene, system, cap, seed and repeat."""
+        return short_name(f"{self.scene}-{self.stem}", _LONGEST_NAME)
+
+    @property
     def stem(self) -> str:
-        """Name of the run's files: system, cap, seed and repeat."""
+        """What tells the run from others on its scene, as a part of file names: system, cap, seed and repeat."""
         again = f"-repeat{self.repeat}" if self.repeat else ""
         return re.sub(r"[^\w.=,-]", "_", f"{self.system}-cap{self.config.cap_max}-seed{self.config.seed}{again}")
 

@@ -10,6 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..evaluation import chart_style
 from ..files.html_page import Section, write_page
+from ..files.lock import folder_lock
 from ..scenes.scene import Scene
 from ..training.log import Progress
 from .charts import arithmetic_chart, seeds_chart
@@ -128,8 +129,9 @@ def sweep(
             on_run=on_run,
         )
     finally:
-        if (Path(output) / RUNS).exists():
-            write_report(output, [*read_runs(output), *more], reference=methods[0].label)
+        if (Path(output) / RUNS).exists() and (records := [*read_runs(output), *more]):
+            with folder_lock(Path(output)):
+                write_report(output, records, reference=methods[0].label)
 
 
 def write_report(

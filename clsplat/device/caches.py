@@ -18,6 +18,7 @@ from ..errors import DeviceError
 USER_VARIABLE = "XDG_CACHE_HOME"
 POCL_VARIABLE = "POCL_CACHE_DIR"
 _NO_FOLDER = f"no folder for a cache of kernels can be written: set {USER_VARIABLE} to one that can"
+_ROOM = 1 << 20  # bytes that must be free: on a full disk PoCL ends the process
 
 
 def user_cache() -> Path:
@@ -32,9 +33,9 @@ def ensure_caches() -> None:
 
     Raises
     ------
-    DeviceError : a temporary folder cannot be made either.
+    DeviceError : a temporary folder cannot be written either.
     """
-    problems = {}
+    problems: dict[str, str] = {}
     pocl = os.environ.get(POCL_VARIABLE)
     if pocl and (problem := _problem(Path(pocl))):
         problems[POCL_VARIABLE] = problem
@@ -47,6 +48,8 @@ def ensure_caches() -> None:
     except OSError:
         raise DeviceError(_NO_FOLDER) from None
     atexit.register(_remove, folder, os.getpid())
+    if _problem(folder):
+        raise DeviceError(_NO_FOLDER)
     for variable in problems:
         os.environ[variable] = str(folder / variable.lower())
     warnings.warn(
@@ -74,10 +77,11 @@ def _exists(folder: Path) -> bool:
 
 
 def _problem(folder: Path) -> str | None:
-    """Return folder and reason if no file can be written in a folder, which is made if it does not exist."""
+    """Return folder and reason if no file of some size can be written there. A missing folder is made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(_ROOM))
             return None
     except OSError as error:
         return f"{folder}: {error.strerror or error}"

@@ -16,7 +16,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from .caches import user_cache
+from ..errors import DeviceError, Remedy
+from .caches import USER_VARIABLE, user_cache
 
 VENDORS_VARIABLE = "OCL_ICD_VENDORS"
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
@@ -32,6 +33,10 @@ def register_pip_runtime() -> bool:
     It must run after `ensure_caches` and before the loader's first use in the process; further calls cost nothing. It
     does nothing if the runtime is not installed, if the system has registered one, or if the user has set
     OCL_ICD_VENDORS.
+
+    Raises
+    ------
+    DeviceError : the folder of the `.icd` files cannot be written.
     """
     library = Path(sys.prefix) / "lib" / RUNTIME
     if not library.is_file():
@@ -51,18 +56,31 @@ def register_pip_runtime() -> bool:
 
 
 def _folder_of(texts: dict[str, bytes]) -> Path:
-    """Return a folder with these files. It is in the user's cache and stays there: other processes use it, too."""
+    """Return a folder with these files. It is in the user's cache and stays there: other processes use it, too.
+
+    Raises
+    ------
+    DeviceError : the folder cannot be written.
+    """
     digest = hashlib.sha256(repr(sorted(texts.items())).encode()).hexdigest()[:16]
     folder = user_cache() / "clsplat" / f"opencl-vendors-{digest}"
-    if not folder.is_dir():
+    if folder.is_dir():
+        return folder
+    written = None
+    try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         written = Path(tempfile.mkdtemp(dir=folder.parent))
         for name, text in texts.items():
             (written / name).write_bytes(text)
-        try:
-            written.rename(folder)
-        except OSError:  # another process was first
+        written.rename(folder)
+    except OSError as error:
+        if written is not None:
             shutil.rmtree(written, ignore_errors=True)
+        if not folder.is_dir():  # else another process was first
+            raise DeviceError(
+                f"{folder}: cannot be written ({error.strerror or error})",
+                Remedy(f"set {USER_VARIABLE} to another folder"),
+            ) from None
     return folder
 
 

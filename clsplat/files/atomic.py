@@ -14,8 +14,11 @@ from typing import BinaryIO
 
 from ..errors import OutputError
 from . import windows
+from .file_names import short_name
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# Of a temporary name, which adds a process and a suffix [bytes]. Most file systems allow 255 bytes.
+_LONGEST_NAME, _LONGEST_SUFFIX = 200, 20
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp(\..*)?")
 # Seconds to wait before further attempts to replace a file. Windows refuses while anybody has it open, and search
 # indexes and virus scanners open every new file for a moment.
@@ -41,7 +44,7 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary file name for code that cannot write to a stream; otherwise as `atomic_writer`.
 
-    The temporary name has the suffix of `path`.
+    The temporary name has the suffix of `path`, because some code chooses a format by it.
 
     Raises
     ------
@@ -50,7 +53,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     # The temporary file lies beside the target because os.replace is atomic only within one file system. The tempfile
     # module is not used: its files are private to the user (mode 0600), and the target would keep that mode.
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp{target.suffix}")
+    suffix = target.suffix if len(os.fsencode(target.suffix)) <= _LONGEST_SUFFIX else ""
+    temporary = target.with_name(f".{short_name(target.name, _LONGEST_NAME)}.{os.getpid()}.tmp{suffix}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         try:

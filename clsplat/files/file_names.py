@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
 from pathlib import PurePosixPath
@@ -21,6 +22,18 @@ def name_key(path: str | os.PathLike[str]) -> str:
 def printable(name: str) -> str:
     """Return a name for programs that take UTF-8 only. Other bytes become escapes, as `\\udcff`."""
     return name.encode("utf-8", "backslashreplace").decode()
+
+
+def short_name(name: str, most: int) -> str:
+    """Return a name of at most this number of bytes. A longer one is cut, and digits tell it from others that begin so.
+
+    most : at least 20.
+    """
+    text = os.fsencode(name)
+    if len(text) <= most:
+        return name
+    digits = hashlib.sha256(text).hexdigest()[:8]
+    return f"{text[: most - 9].decode(errors='ignore')}-{digits}"
 
 
 def can_be_file(text: str) -> bool:

@@ -25,3 +25,14 @@ def _closing(args: list[object]) -> str:
     """Return a program that closes its streams and becomes clsplat."""
     command = [sys.executable, "-c", START, *map(str, args)]
     return f"import os; os.closerange(0, 3); os.execv({sys.executable!r}, {command!r})"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+@pytest.mark.parametrize("args", [["--help"], ["--version"], ["train", "--help"], ["devices"]])
+def test_a_text_that_cannot_be_written_is_one_line(args: list[str]) -> None:
+    """As with standard output in a file on a full disk."""
+    with open("/dev/full", "wb") as full:
+        child = subprocess.run([sys.executable, "-c", START, *args], stdout=full, stderr=subprocess.PIPE, check=False)
+    (line,) = child.stderr.decode().splitlines()
+    assert line == "error: standard output: cannot be written (No space left on device): send it elsewhere"
+    assert child.returncode == 1

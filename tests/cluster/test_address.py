@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -52,4 +53,13 @@ def test_a_file_without_an_address_is_one_line(tmp_path: Path, content: str | No
     if content is not None:
         file.write_text(content)
     with pytest.raises(InputError, match=r"scheduler\.json: .*dask scheduler --scheduler-file"):
+        scheduler_address(ClusterAddress.parse(str(file)))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_a_pipe_is_no_scheduler_file(tmp_path: Path) -> None:
+    """Nobody may ever write into it."""
+    file = tmp_path / "scheduler.json"
+    os.mkfifo(file)
+    with pytest.raises(InputError, match=r"scheduler\.json: not a scheduler file"):
         scheduler_address(ClusterAddress.parse(str(file)))

@@ -209,6 +209,15 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path, monkeypatch: pytest.Monke
         in_folder(place / "run", lambda folder: folder, keep=True)
 
 
+def test_a_folder_that_cannot_be_written_is_replaced(tmp_path: Path) -> None:
+    """A worker on another machine may have another user. Root can write everywhere, so a file is in the way here."""
+    place = marked(tmp_path / UNFINISHED)
+    (place / "run").touch()
+    assert in_folder(place / "run", lambda folder: folder.is_dir() and folder != place / "run")
+    with pytest.raises(OutputError, match=r"run: cannot be written \(File exists\): let the user of this worker"):
+        in_folder(place / "run", lambda folder: folder, keep=True)
+
+
 def test_scenes_are_read_once_in_a_row() -> None:
     read: list[str] = []
 

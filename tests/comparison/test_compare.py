@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,15 @@ def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp
     assert [record["system"] for record in records] == ["gaussian", "default", "gaussian:dense_size=0.02"]
     compare([scene], systems, tmp_path, [CAP], [0], SHORT)
     assert len(counted) == 4
+
+
+def test_a_scene_with_the_longest_name_keeps_its_models(scene: Scene, tmp_path: Path) -> None:
+    """Names that differ only at the end have two files."""
+    long = [replace(scene, name="n" * 254 + end) for end in "ab"]
+    compare(long, parse_methods("gaussian"), tmp_path, [CAP], [0], SHORT, save_models=True)
+    models = list((tmp_path / "models").iterdir())
+    assert len(models) == 2
+    assert all(len(Splats.load(model)) > 0 for model in models)
 
 
 def test_a_curve_is_measured_along_the_run(scene: Scene, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from sweep_records import curve_points, length_records, run_record, seed_records
 from clsplat.comparison import compare as compare_module
 from clsplat.comparison.length_rows import equal_time_rows, length_rows, quality_at, with_shared_seeds
 from clsplat.comparison.methods import parse_methods
-from clsplat.comparison.runs import read_runs
+from clsplat.comparison.runs import RunFile, read_runs
 from clsplat.comparison.sweep import sweep, write_report
 from clsplat.comparison.sweep_rows import (
     auto_rows,
@@ -28,7 +28,7 @@ from clsplat.comparison.sweep_rows import (
 )
 from clsplat.comparison.sweep_tables import auto_table, equal_table, equal_time_table, seed_table
 from clsplat.comparison.table import Record
-from clsplat.errors import InputError
+from clsplat.errors import InputError, OutputError
 from clsplat.evaluation import chart_style
 from clsplat.files.html_page import Section, write_page
 from clsplat.scenes.scene import load_scene
@@ -325,6 +325,23 @@ def test_an_interrupted_sweep_leaves_charts_and_goes_on(
     assert len(records) == 4
     shown = json.loads((tmp_path / "charts" / "size.json").read_text())
     assert len(shown) == 4, "another scene's run is not of this front"
+
+
+def test_a_disk_that_is_full_from_the_start_is_the_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undrawn: None, capture_folder: Path
+) -> None:
+    """runs.jsonl is made and stays empty. That there are no runs to draw is not what went wrong."""
+
+    def full(self: RunFile, record: Record) -> None:
+        self.path.touch()
+        raise OutputError(f"{self.path}: cannot be written (No space left on device): free some space")
+
+    monkeypatch.setattr(compare_module, "warm_up", lambda *arguments: None)
+    monkeypatch.setattr(compare_module, "train_and_measure", lambda *arguments: {})
+    monkeypatch.setattr(RunFile, "add", full)
+    with pytest.warns(UserWarning, match=r"clsplat\[charts\]"), pytest.raises(OutputError, match="No space left"):
+        sweep([load_scene(capture_folder)], parse_methods("gaussian"), tmp_path, [20], [0], {"iterations": 9})
+    assert not (tmp_path / "report.html").exists()
 
 
 def test_runs_that_cannot_be_read(tmp_path: Path) -> None:

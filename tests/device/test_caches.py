@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import subprocess
 import sys
@@ -91,6 +93,29 @@ def test_without_any_folder_the_error_names_the_variable(blocked: Path, monkeypa
     monkeypatch.setattr(caches.tempfile, "mkdtemp", no_space)
     with pytest.raises(DeviceError, match="set XDG_CACHE_HOME to one that can"):
         caches.ensure_caches()
+
+
+@pytest.mark.parametrize("full", [["cache"], ["cache", "elsewhere"]])
+def test_a_full_disk_is_no_place_for_a_cache(
+    blocked: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, full: list[str]
+) -> None:
+    """A small file may still fit, but then PoCL ends the process."""
+
+    class FullFile(io.BytesIO):
+        def write(self, data: object) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    def file_in(dir: Path) -> io.BytesIO:
+        return FullFile() if any(dir.is_relative_to(tmp_path / name) for name in full) else io.BytesIO()
+
+    monkeypatch.setenv(caches.USER_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(caches.tempfile, "TemporaryFile", file_in)
+    monkeypatch.setattr(caches.tempfile, "mkdtemp", lambda prefix: str(tmp_path / "elsewhere"))
+    if "elsewhere" in full:
+        with pytest.raises(DeviceError, match="set XDG_CACHE_HOME to one that can"):
+            caches.ensure_caches()
+    else:
+        assert f"{tmp_path / 'cache' / 'clsplat'}: No space left on device" in warning_of_ensuring()
 
 
 @pytest.mark.skipif(not list_devices(), reason="no OpenCL device")

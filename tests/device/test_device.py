@@ -1,6 +1,7 @@
 """Devices: listing, choice, memory limits, the pip runtime's registration, and `clsplat devices`."""
 
 import dataclasses
+import errno
 import os
 import subprocess
 import sys
@@ -212,6 +213,19 @@ def test_processes_share_the_folder_of_vendors(prefix, monkeypatch):
         monkeypatch.delenv(runtime.VENDORS_VARIABLE)
     assert folders[0] == folders[1] != folders[2]
     assert len(list((prefix / "cache" / "clsplat").iterdir())) == 2
+
+
+def test_a_folder_of_vendors_that_cannot_be_written_is_one_line(prefix, monkeypatch):
+    """Nothing is left behind."""
+
+    def full(path: Path, text: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(DeviceError, match=r"cannot be written \(No space left on device\): set XDG_CACHE_HOME"):
+        runtime.register_pip_runtime()
+    assert not list((prefix / "cache" / "clsplat").iterdir())
+    assert runtime.VENDORS_VARIABLE not in os.environ
 
 
 def test_user_choice_and_system_registration_are_left_alone(prefix, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 
 from clsplat.errors import InputError, OutputError
 from clsplat.files import file_names
+from clsplat.files.atomic import atomic_path, atomic_writer
 from clsplat.files.existing import refuse_existing
 from clsplat.rendering import outputs
 from clsplat.scenes.reconstruct.photo_files import _scene_names
@@ -52,3 +53,23 @@ def test_reserved_characters_are_refused_in_one_line(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(outputs, "RESERVED", frozenset('<>:"|?*'))
     with pytest.raises(InputError, match=r"^view 'day/frame:1.png': this system has no files with : in their name"):
         outputs.output_stems(["day/frame:1.png"])
+
+
+def test_long_names_are_cut_and_stay_different() -> None:
+    assert file_names.short_name("a" * 20, 20) == "a" * 20
+    long = ["Ü" * 30 + tail for tail in ("a", "b")]
+    first, second = (file_names.short_name(name, 31) for name in long)
+    assert first != second
+    for name in (first, second):
+        assert name[:11] == "Ü" * 11
+        assert len(name.encode()) <= 31
+
+
+@pytest.mark.parametrize("name", ["n" * 255, "n" * 251 + ".ply", "n." + "s" * 253, "Ü" * 127])
+def test_a_file_may_have_the_longest_name_of_the_file_system(tmp_path: Path, name: str) -> None:
+    with atomic_writer(tmp_path / name) as stream:
+        stream.write(b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    with atomic_path(tmp_path / "a.ply") as temporary:
+        assert temporary.suffix == ".ply"
+        temporary.touch()
