@@ -59,7 +59,7 @@ class Run:
 
     @property
     def stem(self) -> str:
-        """What tells the run from others on its scene, as a part of file names: system, cap, seed and repeat."""
+        """The part of file names that differs between runs on a scene: system, cap, seed and repeat."""
         again = f"-repeat{self.repeat}" if self.repeat else ""
         return re.sub(r"[^\w.=,-]", "_", f"{self.system}-cap{self.config.cap_max}-seed{self.config.seed}{again}")
 

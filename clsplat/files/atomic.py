@@ -17,7 +17,7 @@ from . import windows
 from .file_names import short_name
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-# Of a temporary name, which adds a process and a suffix [bytes]. Most file systems allow 255 bytes.
+# Longest parts of a temporary name, which adds a process [bytes]. Most file systems allow 255 bytes in all.
 _LONGEST_NAME, _LONGEST_SUFFIX = 200, 20
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp(\..*)?")
 # Seconds to wait before further attempts to replace a file. Windows refuses while anybody has it open, and search

@@ -24,16 +24,16 @@ def printable(name: str) -> str:
     return name.encode("utf-8", "backslashreplace").decode()
 
 
-def short_name(name: str, most: int) -> str:
-    """Return a name of at most this number of bytes. A longer one is cut, and digits tell it from others that begin so.
+def short_name(name: str, n_bytes: int) -> str:
+    """Return a name of at most this number of bytes, at least 20.
 
-    most : at least 20.
+    A longer name is cut, and ends in digits that differ between names that begin alike.
     """
     text = os.fsencode(name)
-    if len(text) <= most:
+    if len(text) <= n_bytes:
         return name
     digits = hashlib.sha256(text).hexdigest()[:8]
-    return f"{text[: most - 9].decode(errors='ignore')}-{digits}"
+    return f"{text[: n_bytes - 9].decode(errors='ignore')}-{digits}"
 
 
 def can_be_file(text: str) -> bool:
