@@ -17,6 +17,9 @@ from .camera import Camera
 
 # Optical axes d count as parallel if the smallest eigenvalue of the mean of I - d d' is below this (about 4 degrees).
 _PARALLEL = 5e-3
+# Cameras that look ahead: shortest mean of their axes, and how far these miss the point nearest to all, in units of the
+# cameras' spread side by side. The square of this ratio is about the part by which the point is too near.
+_ONE_DIRECTION, _MISSED = 0.9, 0.5
 # Weight of the cameras' mean up direction against levelling: a variance of the x axes about level, (6 degrees)^2.
 _LEVELLING = 1e-2
 # Default cameras: 3DGS worlds are camera worlds, whose y axis points down. Images are 60 degrees wide, 4:3.
@@ -171,14 +174,36 @@ def share_unseen(path: Sequence[Camera], splats: Splats, cameras: Sequence[Camer
 
 
 def where_axes_meet(cameras: Sequence[Camera]) -> DoubleArray | None:
-    """Return the point nearest to all optical axes, (3,); None if the axes are parallel."""
+    """Return the point nearest to all optical axes, (3,); None if the axes do not meet.
+
+    Axes that are parallel but for the trembling of a hand do not meet. The point nearest to them lies at the cameras.
+    """
     centres = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     system = across.mean(axis=0)
     if np.linalg.eigvalsh(system)[0] <= _PARALLEL:
         return None
-    return np.asarray(np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(cameras)), np.float64)
+    point = np.asarray(np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(cameras)), np.float64)
+    missed = np.einsum("nij,nj->ni", across, point - centres)
+    return None if _look_ahead(centres, axes, missed) else point
+
+
+def _look_ahead(centres: DoubleArray, axes: DoubleArray, missed: DoubleArray) -> bool:
+    """Return whether cameras side by side look in one direction, and not at one point.
+
+    missed : from each axis to the point nearest to all of them. Of parallel axes, it is as far away as the cameras are
+    from their mean.
+    """
+    ahead = axes.mean(axis=0)
+    length = float(np.linalg.norm(ahead))
+    if length < _ONE_DIRECTION:
+        return False
+    offsets = centres - centres.mean(axis=0)
+    along = offsets @ ahead / length
+    beside = offsets - along[:, None] * ahead / length
+    spread = np.sqrt((beside**2).sum() / len(centres))
+    return bool(np.sqrt((along**2).mean()) < spread and np.sqrt((missed**2).sum() / len(centres)) > _MISSED * spread)
 
 
 def look_at(position: DoubleArray, target: DoubleArray, up: DoubleArray) -> DoubleArray:

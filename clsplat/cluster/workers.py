@@ -198,14 +198,12 @@ async def _keep(address: str, plan: WorkerPlan, on_ready: Callable[[], None]) ->
         name = f"{plan.name}.{attempt}" if attempt else plan.name  # the scheduler may still know the other one
         nanny = package.Nanny(address, **plan.options() | {"name": name})
         _open.add(nanny)
-        start = asyncio.ensure_future(nanny)
         try:
             with suppress(OSError, RuntimeError, TimeoutError):
-                await asyncio.shield(start)
+                await asyncio.shield(nanny)  # a process that is left while it starts would print tracebacks
                 started()
                 await nanny.finished()
         finally:
-            await asyncio.wait([start], timeout=CONNECT_SECONDS)  # a process that is left while it starts goes on
             with suppress(Exception):  # the scheduler may be gone
                 await nanny.close(timeout=CONNECT_SECONDS)
             _open.discard(nanny)

@@ -13,6 +13,7 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.seen import sampled, seen
 from ..errors import InputError
+from ..files.images import image_size, read_image
 from .colmap import NO_POINTS, Points
 from .extent import together
 from .origin import FAR
@@ -22,6 +23,7 @@ _MAX_POINT = 1e30  # the largest coordinate of a point; float32 ends at 3e38
 _MAX_POSITION = 1e12  # training in float32 breaks between this and 1e15
 _TOO_FAR = 1e6  # sizes of the scene from the origin: steps of float32 are a twentieth of the scene there
 _DIGITS = 9  # poses that agree to these decimals count as equal
+_MOST_DECODED = 8  # pairs of photos with equal poses whose pixels are compared, which takes time
 _LEAST_FOCAL = 1e-3  # of the side of an image: an angle of view of 179.9 degrees
 _UNEVEN = 2.0  # largest ratio of the focal lengths of a photo that goes without a warning
 _SEEN_SHARE = 0.01  # of the points that some image must show
@@ -124,12 +126,22 @@ def _warn_of_equal_poses(root: Path, posed: PosedImages) -> None:
         for other in names[1:]
         if not filecmp.cmp(posed.files[names[0]], posed.files[other], shallow=False)
     ]
+    if len(pairs) <= _MOST_DECODED:
+        pairs = [pair for pair in pairs if not _same_pixels(*(posed.files[name] for name in pair))]
     if pairs:
         warnings.warn(
             f"{root}: {len(pairs)} of {len(posed.photos)} photos have the pose of another photo but show something "
             f"else, for example {pairs[0][1]!r} and {pairs[0][0]!r}; correct their poses",
             stacklevel=4,
         )
+
+
+def _same_pixels(file: Path, other: Path) -> bool:
+    """Return whether two files have the same pixels. Their bytes may differ, by a date for example."""
+    try:
+        return image_size(file) == image_size(other) and np.array_equal(read_image(file), read_image(other))
+    except InputError:  # a damaged photo is reported when it is read
+        return False
 
 
 def check_lenses(root: Path, posed: PosedImages) -> None:

@@ -13,7 +13,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.cameras.interpolate import interpolate, resized_by_height
 from clsplat.cameras.make_path import PathRequest, make_path
-from clsplat.cameras.orbits import ellipse, look_at, orbit, share_unseen, spiral
+from clsplat.cameras.orbits import ellipse, look_at, orbit, share_unseen, spiral, where_axes_meet
 from clsplat.errors import InputError
 from clsplat.splats.splats import Splats
 
@@ -211,3 +211,37 @@ def test_a_path_within_seen_sides_does_not_warn(kind: str, views: list[NamedCame
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make_path(PathRequest(kind), cloud(), views)
+
+
+def window(target: object, trembling: float, seed: int, n: int = 28) -> list[Camera]:
+    """Return cameras in a window of 0.8 x 0.5 that look at a target, but for some trembling [degrees]."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform((-0.4, -0.25, -0.05), (0.4, 0.25, 0.05), (n, 3))
+    turned = np.radians(trembling) * rng.standard_normal((n, 3)) * (1, 1, 0)
+    target = np.asarray(target, float)
+    aims = np.tile(target, (n, 1)) if np.isfinite(target).all() else places + np.array([0, 0, 1])
+    return [
+        facing(place, place + Rotation.from_rotvec(turn).apply(aim - place), up=(0, -1, 0))
+        for place, turn, aim in zip(places, turned, aims, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_cameras_that_a_hand_holds_ahead_meet_nowhere(seed: int) -> None:
+    """Trembling makes the axes cross at the cameras, where nothing is."""
+    ahead = window((np.inf, 0, 0), 5.0, seed)
+    centres, axes = positions(ahead), np.array([camera.rotation[2] for camera in ahead])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    nearest = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))
+    assert np.linalg.norm(nearest - centres.mean(axis=0)) < 0.4, "the least squares alone are wrong here"
+    assert where_axes_meet(ahead) is None
+    found = where_axes_meet(window((0, 0, 2), 1.0, seed))
+    assert found is not None
+    assert np.linalg.norm(found - (0, 0, 2)) < 0.2
+
+
+def test_cameras_on_a_way_ahead_meet_as_before() -> None:
+    """They are behind each other, not side by side."""
+    rng = np.random.default_rng(0)
+    walk = [facing((rng.normal(0, 0.2), 0, z), (rng.normal(0, 2.0), 0, z + 10)) for z in np.linspace(0, 14, 30)]
+    assert where_axes_meet(walk) is not None

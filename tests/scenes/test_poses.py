@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import json
 import re
 import struct
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from small_scene import as_text, cloud, model_views, moved, photo_of, write_garden, write_model
 
 from clsplat.errors import InputError
-from clsplat.files.images import write_png
+from clsplat.files.images import read_image, write_png
 from clsplat.scenes.colmap import read_model
 from clsplat.scenes.colmap_binary import write_binary_model
 from clsplat.scenes.origin import camera_centres, size_of
@@ -164,6 +165,10 @@ def test_equal_poses_of_different_photos_are_named(garden: Path) -> None:
         for index in range(9):
             (garden / "images" / f"shot_{index}.png").write_bytes((garden / "images" / "shot_0.png").read_bytes())
         load_scene(garden)
+        pixels = read_image(garden / "images" / "shot_0.png")
+        write_png(garden / "images" / "shot_1.png", pixels, render=True)
+        assert not filecmp.cmp(garden / "images" / "shot_0.png", garden / "images" / "shot_1.png", shallow=False)
+        load_scene(garden)  # with another description in the file
 
 
 @pytest.mark.parametrize(("k1", "size"), [(1e6, "8x6"), (-10.0, "80x60")])

@@ -228,6 +228,21 @@ def test_a_turnover_counts_the_two_halves_of_a_splat_that_is_pruned_for_its_size
     assert np.bincount(edit.source, minlength=4).tolist() == [2, 2, 0, 0]
 
 
+def test_a_large_splat_stays_if_the_cap_has_no_room_for_its_halves() -> None:
+    """3DGS would replace it by two halves. To remove it alone would leave a hole."""
+    arrays = plain(4, 1e-3)
+    arrays["log_scale"][:2, 1] = math.log(1.1 * WORLD_SIZE * EXTENT)
+    loud = stats_of(np.array([5, 9, 0, 0]) * THRESHOLD)
+    sources = [edited(arrays, shapes.GAUSSIAN, loud, cap=cap, prune_large=True).source for cap in (4, 5, 6)]
+    assert [np.bincount(source, minlength=4).tolist() for source in sources] == [
+        [1, 1, 1, 1],
+        [1, 2, 1, 1],
+        [2, 2, 1, 1],
+    ]
+    quiet = stats_of(np.array([5, 0, 0, 0]) * THRESHOLD)
+    assert edited(arrays, shapes.GAUSSIAN, quiet, cap=4, prune_large=True).source.tolist() == [2, 3, 0, 0]
+
+
 def test_what_is_not_finite_goes_and_the_model_is_never_empty() -> None:
     arrays = plain(5, 1e-3, opacity=1e-3)  # all faint
     assert edited(arrays, shapes.GAUSSIAN, stats_of(np.ones(5))).source.tolist() == list(range(5))

@@ -2,9 +2,10 @@
 
 Splats with a high mean screen gradient are densified. A small splat is cloned: it gets a copy in the same place. A
 large splat is split into two halves (halves.py), which are drawn from its Gaussian and smaller by a factor of 1.6.
-Nearly transparent splats are pruned. After the first opacity reset, very large splats are pruned too. Sizes are in
-world units. 3DGS also has a limit on the screen (20 px), which has no effect in its released code
-(graphdeco-inria/gaussian-splatting#123, #643). With few splats that limit would remove most of them.
+Nearly transparent splats are pruned. After the first opacity reset, very large splats are pruned too, as long as the
+cap has room for the smaller ones that take their place. Sizes are in world units. 3DGS also has a limit on the screen
+(20 px), which has no effect in its released code (graphdeco-inria/gaussian-splatting#123, #643). With few splats that
+limit would remove most of them.
 
 With a depth threshold (3DSGS, arXiv 2605.18334) a splat is split if either gradient is high, always along its longest
 axis.
@@ -70,7 +71,7 @@ def plan_adc(
     grad_threshold : threshold of the mean screen gradient.
     depth_threshold : threshold of the mean depth gradient times the extent; 0: not used.
     dense_size : splats larger than this fraction of the extent are split, the others are cloned.
-    prune_large : whether splats larger than WORLD_SIZE are pruned.
+    prune_large : whether splats larger than WORLD_SIZE are pruned, if the cap has room for all splats to be densified.
     turnover : largest number of splats that are pruned to make room under the cap, the faintest first, as a fraction
         of the cap, 0 to 0.5. It has no effect on more splats than the cap.
     split : "published", or "long-axis": all splats with a high gradient are split along their longest axis.
@@ -84,25 +85,34 @@ def plan_adc(
     bright = summary.raw_opacity >= shape.raw_opacity(np.array(MIN_OPACITY))  # this is False for a NaN
     side_by_side = split == "long-axis"
     by_axis = side_by_side or depth_threshold > 0
-    limit = _log(WORLD_SIZE * extent) if prune_large else math.inf
-    keep = bright & (summary.log_size <= limit) if prune_large else bright.copy()
-    if not keep.any():
-        keep = sound
-
     rows, score = _above_threshold(stats, grad_threshold, depth_threshold, extent)
     size = summary.log_size[rows].astype(np.float64)
-    splits = bright[rows] & (size - (0.0 if by_axis else math.log(SPLIT_SHRINK)) <= limit)
-    splits &= by_axis | (size > _log(dense_size * extent))
-    clones = keep[rows] & bright[rows] & ~splits
+    is_large = by_axis | (size > _log(dense_size * extent))
+
+    def candidates(limit: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which splats are kept, and which of the rows are split and cloned. limit : of the size, in log units.
+
+        A splat above the limit is split if its halves are below it, and counts as kept.
+        """
+        keep = bright & (summary.log_size <= limit)
+        if not keep.any():
+            keep = sound.copy()
+        splits = bright[rows] & is_large & (size - (0.0 if by_axis else math.log(SPLIT_SHRINK)) <= limit)
+        clones = keep[rows] & bright[rows] & ~splits
+        keep[rows[splits]] = True
+        return keep, splits, clones
+
+    keep, splits, clones = candidates(_log(WORLD_SIZE * extent) if prune_large else math.inf)
+    if prune_large and np.count_nonzero(keep) + np.count_nonzero(splits | clones) > cap:
+        keep, splits, clones = candidates(math.inf)
     if turnover and len(keep) <= cap:
-        growth = np.count_nonzero(splits | clones) + np.count_nonzero(splits & ~keep[rows])
-        missing = int(np.count_nonzero(keep) + growth - cap)
+        missing = int(np.count_nonzero(keep) + np.count_nonzero(splits | clones) - cap)
         among = np.flatnonzero(keep)
         faint = among[smallest(summary.raw_opacity[among], min(missing, int(turnover * cap)))]
         keep[faint] = False
         at = np.isin(rows, faint, kind="table")
         splits[at] = clones[at] = False
-    halved, cloned = _best(rows, score, splits, clones, keep, cap)
+    halved, cloned = _best(rows, score, splits, clones, cap - int(np.count_nonzero(keep)))
     stays = keep.copy()
     stays[halved] = False
     stay = np.flatnonzero(stays)
@@ -171,20 +181,14 @@ def _log(length: float) -> np.float64:
 
 
 def _best(
-    rows: Indices,
-    score: DoubleArray,
-    splits: NDArray[np.bool_],
-    clones: NDArray[np.bool_],
-    keep: NDArray[np.bool_],
-    cap: int,
+    rows: Indices, score: DoubleArray, splits: NDArray[np.bool_], clones: NDArray[np.bool_], room: int
 ) -> tuple[Indices, Indices]:
-    """Return the rows to split and the rows to clone that the cap has room for, in rising order.
+    """Return the rows to split and the rows to clone, in rising order: the best ones if there is no room for all.
 
-    rows : rows above a threshold, in rising order. score, splits, clones : of these. keep : of all splats.
+    rows : rows above a threshold, in rising order. score, splits, clones : of these. room : most splats to add.
     """
     chosen = np.flatnonzero(splits | clones)
-    cost, room = np.where(keep[rows[chosen]], 1, 2), cap - np.count_nonzero(keep)  # a split saves one of a pruned size
-    if cost.sum() > room:
+    if len(chosen) > room:
         order = np.argsort(-score[chosen], kind="stable")
-        chosen = np.sort(chosen[order[np.cumsum(cost[order]) <= room]])
+        chosen = np.sort(chosen[order[: max(room, 0)]])
     return rows[chosen[splits[chosen]]], rows[chosen[clones[chosen]]]
