@@ -12,6 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 from blender_flat import flat, walk
+from blender_front import front, stand
 from blender_objects import dishes, metals, plant, wires
 from blender_places import garden, lane, room
 from mathutils import Matrix, Vector
@@ -89,6 +90,11 @@ def flat_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[l
     return every_few([look_at(eye, target) for eye, target in walk(rng, n_train + n_test)], n_test)
 
 
+def front_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[list[Matrix], list[Matrix]]:
+    """Return the poses of photos from one side."""
+    return every_few([look_at(eye, target) for eye, target in stand(rng, n_train + n_test)], n_test)
+
+
 @dataclass(frozen=True)
 class SceneKind:
     """How a scene is photographed.
@@ -112,6 +118,7 @@ SCENES = {
     "dishes": SceneKind(dishes),
     "room": SceneKind(room, room_cameras, True, False, PLACE_FIELD_OF_VIEW),
     "flat": SceneKind(flat, flat_cameras, True, False, 1.2, 10),
+    "front": SceneKind(front, front_cameras, True, True, PLACE_FIELD_OF_VIEW, 8),
     "garden": SceneKind(garden, garden_cameras, True, True, PLACE_FIELD_OF_VIEW),
     "lane": SceneKind(lane, lane_cameras, True, True, PLACE_FIELD_OF_VIEW),
 }

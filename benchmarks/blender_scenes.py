@@ -6,10 +6,10 @@
     CLSPLAT_DATA=FOLDER python benchmarks/defaults.py --cases plant:-1:50000:7000 --systems default,3dgs
 
 Each object lies in a cube of side 2.6 around the origin. Cameras look at it from the upper half of a sphere, as in
-NeRF-synthetic: test views are a spiral, training views are random. Photos are RGBA. Four places surround their
-cameras instead. They have points on surfaces that cameras see, as from COLMAP. `room` is closed. `flat` is a walk
-through two rooms with windows. `garden` has a table that cameras walk around, and houses, hills and the sky behind it.
-`lane` is a walk between houses.
+NeRF-synthetic: test views are a spiral, training views are random. Photos are RGBA. Five places are seen from inside
+instead. They have points on surfaces that cameras see, as from COLMAP. `room` is closed. `flat` is a walk through two
+rooms with windows. `front` has photos from one side only, as LLFF's scenes: a plant before a shelf and a window.
+`garden` has a table that cameras walk around, and houses, hills and the sky behind it. `lane` is a walk between houses.
 Everything is drawn with fixed seeds. Photos that are there are kept, so an interrupted command goes on.
 """
 
@@ -20,7 +20,7 @@ import importlib.util
 from pathlib import Path
 
 OBJECTS = ("plant", "metals", "wires", "dishes")  # with transparent photos
-NAMES = (*OBJECTS, "room", "flat", "garden", "lane")
+NAMES = (*OBJECTS, "room", "flat", "front", "garden", "lane")
 
 
 def main() -> None:

@@ -2,8 +2,8 @@
 
 Splats with a high mean screen gradient are densified. A small splat is cloned: it gets a copy in the same place. A
 large splat is split into two halves (halves.py), which are drawn from its Gaussian and smaller by a factor of 1.6.
-Nearly transparent splats are pruned. After the first opacity reset, very large splats are pruned too, as long as the
-cap has room for the smaller ones that take their place. Sizes are in world units. 3DGS also has a limit on the screen
+Nearly transparent splats are pruned. After the first opacity reset, very large splats are pruned too, if the cap has
+room for the smaller ones that take their place. Sizes are in world units. 3DGS also has a limit on the screen
 (20 px), which has no effect in its released code (graphdeco-inria/gaussian-splatting#123, #643). With few splats that
 limit would remove most of them.
 
