@@ -192,8 +192,8 @@ def where_axes_meet(cameras: Sequence[Camera]) -> DoubleArray | None:
 def _look_ahead(centres: DoubleArray, axes: DoubleArray, missed: DoubleArray) -> bool:
     """Return whether cameras side by side look in one direction, and not at one point.
 
-    missed : from each axis to the point nearest to all of them. Parallel axes miss it by as much as the cameras are away
-    from their mean.
+    missed : from each axis to the point nearest to all of them. Parallel axes miss it by as much as the cameras are
+    away from their mean.
     """
     ahead = axes.mean(axis=0)
     length = float(np.linalg.norm(ahead))
