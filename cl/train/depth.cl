@@ -2,9 +2,11 @@
 // centre in all three channels. SH_C0 is the constant harmonic (clsplat/splats/harmonics.py). Images are planar with a zero
 // margin (rasterize.cl).
 
-// Relative step of the depth from one pixel of the photo to the next. The penalty grows linearly above it, and quadratically
-// below it.
+// Relative steps of the depth from one pixel of the photo to the next. Below the first one the penalty grows quadratically,
+// above it linearly. Far above the second one it hardly grows in views without a photo: there one thing ends in front of
+// another. In a photo its edges say so.
 #define STEEPEST R(0.01)
+#define BREAK R(0.05)
 #define MOST_LIGHT R(0.2)  // pixels that let more light through have no depth
 #define BYTE R(255.0)
 
@@ -37,8 +39,8 @@ static inline real difference(global const uchar *restrict truth, ulong at, ulon
 }
 
 // Overwrites v_color [3 planes] with the gradient of weight * sum of exp(-edge * difference) * h((d - e) / (r m)). The sum
-// is over all pairs of neighbours with depths d and e, m is their mean, and h is |x| with a quadratic middle. m counts as
-// a constant. r is `reduction`: the photo is r times as wide and as high as the depths, and the pixel that belongs to a
+// is over all pairs of neighbours with depths d and e, and m is their mean, which counts as a constant. h has the slope
+// x / STEEPEST, between -1 and 1, without a photo divided by 1 + (x / BREAK)^2. r is `reduction`: the photo is r times as wide and as high as the depths, and the pixel that belongs to a
 // depth is the first one of r x r. photo_stride, photo_plane: of the photo. edge: 0 for views without a photo. Global size:
 // (at least width, height).
 kernel void smooth_depth(
@@ -67,9 +69,11 @@ kernel void smooth_depth(
         const ulong other = pixel_at(u, v, stride);
         if (transmittance[at] >= MOST_LIGHT || transmittance[other] >= MOST_LIGHT) continue;
         const real scale = reduction * max(R(0.5) * (color[at] + color[other]), R(1e-12));
-        const real slope = lanes_clamp((color[at] - color[other]) / (scale * STEEPEST), R(-1.0), R(1.0));
+        const real step = (color[at] - color[other]) / scale, far = step / BREAK;
+        const real slope = lanes_clamp(step / STEEPEST, R(-1.0), R(1.0));
         const ulong beside = pixel_at(u * reduction, v * reduction, photo_stride);
-        const real flat = edge > 0 ? exp(-edge * difference(truth, in_photo, beside, photo_plane)) : R(1.0);
+        const real flat =
+            edge > 0 ? exp(-edge * difference(truth, in_photo, beside, photo_plane)) : 1 / (1 + far * far);
         sum += flat * slope / scale;
     }
     v_color[at] = weight * sum;

@@ -32,7 +32,7 @@ from clsplat.training.targets import Targets, reduced_camera
 from clsplat.training.trainer import Trainer
 
 Image = NDArray[np.float64]
-STEEPEST, MOST_LIGHT = 0.01, 0.2  # of cl/train/depth.cl
+STEEPEST, BREAK, MOST_LIGHT = 0.01, 0.05, 0.2  # of cl/train/depth.cl
 WEIGHT, SEED = 3.0, 5
 GEOMETRY = ("mean", "quat", "log_scale", "opacity_logit")
 
@@ -64,12 +64,19 @@ def pairs_of(depth: Image, light: Image, photo: NDArray[np.uint8] | None, factor
     return Pairs((weights[0], weights[1]), (middles[0], middles[1]))
 
 
-def penalty(depth: Image, pairs: Pairs, factor: int = 1) -> float:
-    """Return the penalty of a depth image; the mean depths are those of `pairs`. factor : see `pairs_of`."""
+def penalty(depth: Image, pairs: Pairs, factor: int = 1, *, breaks: bool) -> float:
+    """Return the penalty of a depth image; the mean depths are those of `pairs`.
+
+    factor : see `pairs_of`. breaks : whether large steps hardly count, as in views without a photo.
+    """
     total = 0.0
     for (one, other), weight, middle in zip(neighbours(depth), *pairs, strict=True):
         step = np.abs((one - other) / (factor * middle))
-        height = np.where(step < STEEPEST, step**2 / (2 * STEEPEST), step - STEEPEST / 2)
+        if breaks:
+            foot = np.log1p((np.minimum(step, STEEPEST) / BREAK) ** 2) * BREAK**2 / (2 * STEEPEST)
+            height = foot + BREAK * (np.arctan(np.maximum(step, STEEPEST) / BREAK) - math.atan(STEEPEST / BREAK))
+        else:
+            height = np.where(step < STEEPEST, step**2 / (2 * STEEPEST), step - STEEPEST / 2)
         total += float((weight * height).sum())
     return WEIGHT * total / depth.size
 
@@ -129,6 +136,7 @@ def test_the_gradient_of_an_image_is_that_of_the_penalty(scheduled: tuple[Device
     height, width = view.camera.height // factor, view.camera.width // factor
     layout = ImageLayout(width, height)
     depth = 2 + 0.03 * rng.random((height, width))
+    depth[:, width // 2 :] *= 3  # one thing in front of another
     light = np.where(rng.random((height, width)) < 0.2, 0.5, 0.1)
     pool, smoothness = made.smoothness.pipeline.pool, made.smoothness
     for edge, photo in ((EDGE, view.image), (0.0, None)):
@@ -158,7 +166,8 @@ def test_the_gradient_of_an_image_is_that_of_the_penalty(scheduled: tuple[Device
             ends = [depth.copy(), depth.copy()]
             for sign, moved in zip((1, -1), ends, strict=True):
                 moved[place] += sign * step
-            expected[place] = (penalty(ends[0], pairs, factor) - penalty(ends[1], pairs, factor)) / (2 * step)
+            sums = [penalty(end, pairs, factor, breaks=photo is None) for end in ends]
+            expected[place] = (sums[0] - sums[1]) / (2 * step)
         assert relative_error(found[:, :, 0], expected) < 1e-6
         assert not found[:, :, 1:].any()
 
@@ -197,8 +206,8 @@ def test_the_gradient_of_splats_is_that_of_the_penalty(
 
         def total(moved: dict[str, NDArray[np.float64]]) -> float:
             return math.fsum(
-                penalty(render_reference(moved, camera, **SMOOTH).depth, side, factor)
-                for (camera, _), side in zip(cameras, pairs, strict=True)  # noqa: B023
+                penalty(render_reference(moved, camera, **SMOOTH).depth, side, factor, breaks=photo is None)
+                for (camera, photo), side in zip(cameras, pairs, strict=True)  # noqa: B023
             )
 
         found = made.gradient(0, iteration)
