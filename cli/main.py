@@ -198,8 +198,8 @@ def _of_system(error: OSError) -> ClsplatError:
     """Return the error of clsplat for one of the system."""
     if error.filename:
         return ClsplatError(f"{error.filename}: {error.strerror}")
-    *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
-    if innermost.f_code is click.echo.__code__:
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    if frames and frames[-1].f_code is click.echo.__code__:
         return ClsplatError(f"standard output: cannot be written ({error.strerror}): send it elsewhere")
     return ClsplatError(str(error))
 

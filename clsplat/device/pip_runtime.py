@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 from ..errors import DeviceError, Remedy
-from .caches import USER_VARIABLE, user_cache
+from .caches import user_cache
 
 VENDORS_VARIABLE = "OCL_ICD_VENDORS"
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
@@ -79,7 +79,7 @@ def _folder_of(texts: dict[str, bytes]) -> Path:
         if not folder.is_dir():  # else another process was first
             raise DeviceError(
                 f"{folder}: cannot be written ({error.strerror or error})",
-                Remedy(f"set {USER_VARIABLE} to another folder"),
+                Remedy("set XDG_CACHE_HOME to another folder"),
             ) from None
     return folder
 
