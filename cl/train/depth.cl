@@ -40,9 +40,9 @@ static inline real difference(global const uchar *restrict truth, ulong at, ulon
 
 // Overwrites v_color [3 planes] with the gradient of weight * sum of exp(-edge * difference) * h((d - e) / (r m)). The sum
 // is over all pairs of neighbours with depths d and e, and m is their mean, which counts as a constant. h has the slope
-// x / STEEPEST, between -1 and 1, without a photo divided by 1 + (x / BREAK)^2. r is `reduction`: the photo is r times as wide and as high as the depths, and the pixel that belongs to a
-// depth is the first one of r x r. photo_stride, photo_plane: of the photo. edge: 0 for views without a photo. Global size:
-// (at least width, height).
+// x / STEEPEST, between -1 and 1, without a photo divided by 1 + (x / BREAK)^2. r is `reduction`: the photo is r times as
+// wide and as high as the depths, and the pixel that belongs to a depth is the first one of r x r. photo_stride,
+// photo_plane: of the photo. edge: 0 for views without a photo. Global size: (at least width, height).
 kernel void smooth_depth(
     global const real *restrict color,
     global const real *restrict transmittance,

@@ -9,7 +9,7 @@ import platform
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -257,10 +257,10 @@ def serve(address: str, plans: Sequence[WorkerPlan], on_ready: Callable[[WorkerP
         if on_ready is not None:
             on_ready(plan)
 
-    begun: list[tuple[asyncio.AbstractEventLoop, asyncio.Task[None] | None]] = []
+    begun: Future[tuple[asyncio.AbstractEventLoop, Any]] = Future()
 
     async def run() -> None:
-        begun.append((asyncio.get_running_loop(), asyncio.current_task()))
+        begun.set_result((asyncio.get_running_loop(), asyncio.current_task()))
         if not await _answers_in_time(address):
             raise no_scheduler(address)
         await asyncio.gather(*(_keep(address, plan, partial(ready, plan)) for plan in plans))
@@ -271,9 +271,9 @@ def serve(address: str, plans: Sequence[WorkerPlan], on_ready: Callable[[WorkerP
             while not wait([end], POLL).done:
                 pass
         finally:
-            for loop, task in begun:
-                if task is not None and not end.done():
-                    loop.call_soon_threadsafe(task.cancel)
+            loop, task = begun.result(CONNECT_SECONDS)  # Ctrl-C may come before the loop runs
+            with suppress(RuntimeError):  # it has ended
+                loop.call_soon_threadsafe(task.cancel)
             wait([end])
             _end_the_rest()
         end.result()

@@ -35,7 +35,7 @@ def ensure_caches() -> None:
     ------
     DeviceError : a temporary folder cannot be written either.
     """
-    problems: dict[str, str] = {}
+    problems = {}
     pocl = os.environ.get(POCL_VARIABLE)
     if pocl and (problem := _problem(Path(pocl))):
         problems[POCL_VARIABLE] = problem

@@ -94,7 +94,7 @@ def plan_adc(
 
         A splat above the limit is split if its halves are below it, and counts as kept.
         """
-        keep = bright & (summary.log_size <= limit)
+        keep = bright & (summary.log_size <= limit) if limit < math.inf else bright.copy()
         if not keep.any():
             keep = sound.copy()
         splits = bright[rows] & is_large & (size - (0.0 if by_axis else math.log(SPLIT_SHRINK)) <= limit)
