@@ -43,7 +43,7 @@ from ..splats.splats import Splats
 from .config import OPTIONS, TrainConfig
 from .initialise import FROM_POINTS, MIN_POINTS, names_model
 from .log import Progress
-from .near_plane import FARTHEST, choose_near_plane
+from .near_plane import choose_near_plane
 from .options.density import Adc, Mcmc
 from .options.groups import OptimConfig
 from .options.option import option_table
@@ -152,9 +152,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if filtered.get("antialiased") is False:
         reasons.append("no antialiasing, because the model that it starts from has none")
     if config.near_plane is None:
-        chosen["near_plane"] = near = choose_near_plane(scene)
-        if near < FARTHEST:
-            reasons.append(f"a near plane of {near:g} units, because the scene is small or near to cameras")
+        chosen["near_plane"], nearer = choose_near_plane(scene)
+        if nearer:
+            reasons.append(f"a near plane of {chosen['near_plane']:g} units, because {nearer}")
     return Decision(_with(config, chosen), tuple(reasons))
 
 

@@ -20,11 +20,23 @@ NEAREST_SHARE = 0.01  # of the points in the images; single points may be wrong
 _MAX_NEARER = 0.1  # largest share of the points in the images that may be nearer than the near plane
 
 
-def choose_near_plane(scene: Scene) -> float:
-    """Return 0.2, or less in a scene that is small or comes near to cameras [world units, two digits]."""
+def choose_near_plane(scene: Scene) -> tuple[float, str]:
+    """Return the near plane and why it is nearer than `FARTHEST`.
+
+    Returns
+    -------
+    near_plane : `FARTHEST` or less [world units, two digits].
+    reason : empty if the near plane is `FARTHEST`.
+    """
     depth = _point_depths(scene)
     nearest = DEPTH_SHARE * float(np.quantile(depth, NEAREST_SHARE)) if len(depth) else FARTHEST
-    return float(f"{min(FARTHEST, EXTENT_SHARE * scene.extent, nearest):.2g}")
+    limits = (
+        (FARTHEST, ""),
+        (EXTENT_SHARE * scene.extent, "the cameras stand close together"),
+        (nearest, "some points are close to a camera"),
+    )
+    rounded = [(float(f"{limit:.2g}"), reason) for limit, reason in limits]
+    return min(rounded, key=lambda limit: limit[0])
 
 
 def check_near_plane(scene: Scene, near_plane: float) -> None:

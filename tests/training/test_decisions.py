@@ -285,6 +285,8 @@ def test_the_near_plane_is_that_of_3dgs_unless_the_scene_is_small_or_near(scene:
     place = middle.position + 0.1 * middle.rotation[2]
     close = replace(scene, points=Points(np.tile(place, (len(points.xyz), 1)), points.rgb, points.track_length))
     assert decide(close, TrainConfig()).config.near_plane == pytest.approx(min(0.05, 0.05 * scene.extent), rel=0.05)
+    assert "points are close to a camera" in str(decide(of_size(close, 3.0), TrainConfig()))
+    assert "because the cameras stand close together" in str(decide(of_size(away, 0.1), TrainConfig()))
     assert decide(scene, TrainConfig(near_plane=0.7)).config.near_plane == 0.7
     unnamed = dataclasses.replace(TrainConfig(), seed=3)  # it passes all options of the run to the constructor
     assert decide(scene, unnamed).config.near_plane == decide(scene, TrainConfig()).config.near_plane
