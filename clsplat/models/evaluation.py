@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import statistics
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, OutputError, check_choice
+from ..evaluation.evaluate import Evaluation
 from ..evaluation.evaluate import evaluate as evaluate_views
 from ..evaluation.floaters import measure_floaters
 from ..evaluation.metrics import DEFAULT_PROTOCOL, MetricProtocol
@@ -24,10 +25,11 @@ from ..rendering.outputs import ImageWriter, output_stems
 from ..rendering.renderer import Rendered, Renderer
 from ..rendering.views import RenderOutput, ViewProgress, files_of
 from ..scenes.options import VIEW_SETS
-from ..scenes.scene import View
+from ..scenes.scene import Scene, View
 from ..splats.color import Color
 from ..splats.formats.any_file import stored_bytes
 from ..splats.stats import complexity
+from ..training.folder import ModelFolder
 from .evaluation_report import write_model_report
 from .measurements import ModelEvaluation, ViewRecorder
 from .model import LoadedModel, SceneChoice, load_model, model_at
@@ -189,27 +191,7 @@ class Evaluator:
         options = self.options
         background = model.background if options.background is None else options.background
         scene = model.load_scene(options.scene, background=background)
-        views = {
-            "test": scene.test,
-            "train": scene.train,
-            "validation": scene.validation,
-            "all": scene.views,
-        }[options.view_set]
-        if not views and options.view_set == "test" and scene.test_names:
-            raise InputError(
-                f"{model.path}: none of its {len(scene.test_names)} test photos can be used: "
-                "copy them to the scene, or measure training views with --set train"
-            )
-        if not views and options.view_set == "validation":
-            raise InputError(
-                f"{model.path}: has no validation views: measure others with --set, or train with "
-                "clsplat train --validate"
-            )
-        if not views:
-            raise InputError(
-                f"{model.path}: was trained on all views, none is left to test it on: "
-                "measure training views with --set train, or train with clsplat train --eval"
-            )
+        views = self._views_of(scene, model)
         recorder = ViewRecorder(self.lpips, self.flip, options.report, options.protocol.corrected)
         names, numbers = [view.name for view in views], count(1)
         refuse_existing(files_of(RenderOutput(renders), names), self.overwrite, scene.photo_files)
@@ -227,7 +209,46 @@ class Evaluator:
         per_view = {
             metric: {name: values[metric] for name, values in measured.per_view.items()} for metric in ("SSIM", "PSNR")
         } | recorder.per_view
-        result = {
+        result = self._result(model, views, measured, recorder, background)
+        if scene.train:
+            test_psnr = measured.psnr if options.view_set == "test" else None
+            result["floaters"] = measure_floaters(
+                self.renderer, model.splats, scene.train, background, options.protocol, test_psnr
+            ).to_json()
+        evaluation = ModelEvaluation(model, scene, result, per_view, recorder.images)
+        return evaluation if model.folder is None else self._written(evaluation, model.folder)
+
+    def _views_of(self, scene: Scene, model: LoadedModel) -> list[View]:
+        """Return the views to measure. Raise InputError if there are none."""
+        view_set = self.options.view_set
+        views = {
+            "test": scene.test,
+            "train": scene.train,
+            "validation": scene.validation,
+            "all": scene.views,
+        }[view_set]
+        if views:
+            return views
+        if view_set == "test" and scene.test_names:
+            raise InputError(
+                f"{model.path}: none of its {len(scene.test_names)} test photos can be used: "
+                "copy them to the scene, or measure training views with --set train"
+            )
+        if view_set == "validation":
+            raise InputError(
+                f"{model.path}: has no validation views: measure others with --set, or train with "
+                "clsplat train --validate"
+            )
+        raise InputError(
+            f"{model.path}: was trained on all views, none is left to test it on: "
+            "measure training views with --set train, or train with clsplat train --eval"
+        )
+
+    def _result(
+        self, model: LoadedModel, views: Sequence[View], measured: Evaluation, recorder: ViewRecorder, background: Color
+    ) -> dict[str, Any]:
+        """Return the entry of results.json, without floaters."""
+        return {
             "SSIM": measured.ssim,
             "PSNR": measured.psnr,
             **{metric: statistics.fmean(values.values()) for metric, values in recorder.per_view.items()},
@@ -236,29 +257,31 @@ class Evaluator:
             **complexity(model.splats).to_json(),
             "shape": model.splats.shape,
             "normalisation": model.splats.normalisation,
-            "set": options.view_set,
+            "set": self.options.view_set,
             "views": len(views),
             "sizes": sorted({(view.camera.width, view.camera.height) for view in views}),
             "background": list(background),
             "device": str(self.renderer.device.info),
-            "protocol": options.protocol.describe() | recorder.describe(),
+            "protocol": self.options.protocol.describe() | recorder.describe(),
         }
-        if scene.train:
-            test_psnr = measured.psnr if options.view_set == "test" else None
-            result["floaters"] = measure_floaters(
-                self.renderer, model.splats, scene.train, background, options.protocol, test_psnr
-            ).to_json()
-        evaluation = ModelEvaluation(model, scene, result, per_view, recorder.images)
-        if model.folder is None:
-            return evaluation
+
+    def _written(self, evaluation: ModelEvaluation, folder: ModelFolder) -> ModelEvaluation:
+        """Write the measurements into the model's folder, and the report if it is asked for.
+
+        Returns
+        -------
+        The evaluation with its report, or with the error that stopped the writing.
+        """
+        options, model = self.options, evaluation.model
         ending = "" if options.view_set == "test" else f"_{options.view_set}"
-        key = f"{'ours' if model.folder.config_path.is_file() else 'clsplat'}_{model.iteration}"
+        key = f"{'ours' if folder.config_path.is_file() else 'clsplat'}_{model.iteration}"
         try:
-            for stem, entry in (("results", result), ("per_view", per_view)):
-                _add_entry(model.folder.path / f"{stem}{ending}.json", key, entry)
+            for stem, entry in (("results", evaluation.result), ("per_view", evaluation.per_view)):
+                _add_entry(folder.path / f"{stem}{ending}.json", key, entry)
             if not self.write_reports:
                 return evaluation
-            file, name = model.folder.path / f"{Path(REPORT).stem}{ending}.html", options.scene_name or scene.name
+            file = folder.path / f"{Path(REPORT).stem}{ending}.html"
+            name = options.scene_name or evaluation.scene.name
             report = write_model_report(file, name, [evaluation], [real_path(model.path).name])
         except OutputError as error:
             return replace(evaluation, write_error=error)
@@ -272,7 +295,7 @@ def _on_equal_views(one: ModelEvaluation, other: ModelEvaluation) -> bool:
     return named is not None and all(sizes[named[name]] == size for name, size in others.items())
 
 
-def _add_entry(path: Path, key: str, entry: dict[str, Any]) -> None:
+def _add_entry(path: Path, key: str, entry: Mapping[str, Any]) -> None:
     """Add an entry to the JSON object in a file, which may hold entries of other iterations."""
     try:
         known = read_object(path)

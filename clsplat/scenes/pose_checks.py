@@ -78,7 +78,7 @@ def without_unseen_points(root: Path, points: Points, cameras: Sequence[Camera])
     warnings.warn(
         f"{root}: its photos show {shown.mean():.1%} of its {len(points)} points, so the points do not fit the poses; "
         "they are left out",
-        stacklevel=3,
+        stacklevel=4,
     )
     return NO_POINTS
 
@@ -91,7 +91,7 @@ def warn_of_lone_cameras(root: Path, names: Sequence[str], cameras: Sequence[Cam
         warnings.warn(
             f"{root}: {len(lone)} of {len(names)} photos have a camera far from all others, for example {lone[0]!r}: "
             "check its pose",
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

@@ -215,23 +215,8 @@ def load_scene(
     left_out, n = dict(sorted((posed.left_out | unusable).items())), len(posed.listed)
     check_left_out(root, posed, left_out)
     warn_of_left_out(root, left_out, n)
-    if only is None and all(view.name in test_names for view in views):
-        raise InputError(
-            f"{root}: no training view is left: all {len(views)} photos that can be used are test views; "
-            "add photos, or turn eval off"
-        )
-    points = posed.points
-    if only is None:
-        if test_names and test_names.isdisjoint(names):
-            warnings.warn(
-                f"{root}: none of its {len(test_names)} test views can be used, so nothing will be measured; change "
-                "test_every, or name test views",
-                stacklevel=2,
-            )
-        cameras = [view.camera for view in views]
-        points = without_unseen_points(root, points, cameras)
-        warn_of_lone_cameras(root, names, cameras)
-        _warn_of_copies(root, dict(zip(names, digests, strict=True)), test_names)
+    digest_of = dict(zip(names, digests, strict=True))
+    points = posed.points if only is not None else _points_of_whole(root, views, posed.points, test_names, digest_of)
     folder = real_path(root)
     return Scene(
         (folder.parent if root.is_file() else folder).name,
@@ -252,10 +237,43 @@ def load_scene(
             bars=list(bars),
         ),
         left_out,
-        dict(zip(names, digests, strict=True)),
+        digest_of,
         [file for name in names for file in _files_of(name, posed, mask_of)],
         origin=posed.origin,
     )
+
+
+def _points_of_whole(
+    root: Path, views: Sequence[View], points: Points, test_names: Collection[str], digests: Mapping[str, str]
+) -> Points:
+    """Check the views of a whole scene, and return its points, without them if no photo shows any.
+
+    Parameters
+    ----------
+    views : all views that can be used.
+    digests : of the files of each view, by name.
+
+    Raises
+    ------
+    InputError : no training view is left.
+    """
+    names = [view.name for view in views]
+    if all(name in test_names for name in names):
+        raise InputError(
+            f"{root}: no training view is left: all {len(views)} photos that can be used are test views; "
+            "add photos, or turn eval off"
+        )
+    if test_names and set(test_names).isdisjoint(names):
+        warnings.warn(
+            f"{root}: none of its {len(test_names)} test views can be used, so nothing will be measured; change "
+            "test_every, or name test views",
+            stacklevel=3,
+        )
+    cameras = [view.camera for view in views]
+    points = without_unseen_points(root, points, cameras)
+    warn_of_lone_cameras(root, names, cameras)
+    _warn_of_copies(root, digests, test_names)
+    return points
 
 
 def _warn_of_copies(root: Path, digests: Mapping[str, str], test_names: Collection[str]) -> None:
@@ -267,7 +285,7 @@ def _warn_of_copies(root: Path, digests: Mapping[str, str], test_names: Collecti
         warnings.warn(
             f"{root}: {len(copies)} of {len(test_names)} test photos are training photos, too, for example {name!r} "
             f"and {copy!r}: remove the copies, or their metrics are too good",
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
