@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,6 +24,10 @@ from .evaluate import describe
 from .options import PATH, device_option, overwrite_option, quiet_option
 from .progress import ViewCount, activity_line, duration
 from .train import report_interruption, run_training
+
+if TYPE_CHECKING:
+    from clsplat.models.measurements import ModelEvaluation
+    from clsplat.scenes.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -96,11 +102,9 @@ def demo(
     trained in blocks, one by one or on the workers of --cluster. After an interruption `clsplat train --resume -m
     OUT/model` goes on.
     """
-    from clsplat.blocks.train import PICTURE
     from clsplat.cluster.pool import check_cluster
     from clsplat.evaluation.metrics import DEFAULT_PROTOCOL
     from clsplat.models.evaluation import EvaluationOptions, evaluate
-    from clsplat.rendering.outputs import output_stems
     from clsplat.scenes.demo.make import make_demo_scene, make_large_demo_scene
     from clsplat.scenes.scene import load_scene
 
@@ -143,17 +147,28 @@ def demo(
             device=device,
             progress=progress,
         )
-    result = measured.result
-    if quiet:
-        return
-    click.echo(
-        f"\ntest views ({len(scene.test)}): PSNR {result['PSNR']:.2f} dB, SSIM {result['SSIM']:.4f}, "
-        f"{result['render_ms']:.1f} ms each; {result['splats']} splats"
+    if not quiet:
+        click.echo(f"\ntest views ({len(scene.test)}): {_summary(measured.result)}")
+        click.echo(describe(DEFAULT_PROTOCOL))
+        click.echo(f"all done in {duration(time.perf_counter() - start)}. Look at:")
+        _print_files(scene, measured, folder, renders, large)
+
+
+def _summary(result: Mapping[str, Any]) -> str:
+    """Return the measurements in one line. result : entry of results.json."""
+    return (
+        f"PSNR {result['PSNR']:.2f} dB, SSIM {result['SSIM']:.4f}, {result['render_ms']:.1f} ms each; "
+        f"{result['splats']} splats"
     )
-    click.echo(describe(DEFAULT_PROTOCOL))
-    click.echo(f"all done in {duration(time.perf_counter() - start)}. Look at:")
+
+
+def _print_files(scene: Scene, measured: ModelEvaluation, folder: ModelFolder, renders: Path, large: bool) -> None:
+    """Print what the demo has written, a file a line. renders : folder of the rendered views."""
+    from clsplat.blocks.train import PICTURE
+    from clsplat.rendering.outputs import output_stems
+
     first = scene.test[0].name
-    photo = next(path for path in (place / first, place / "images" / first) if path.exists())
+    photo = next(path for path in (scene.path / first, scene.path / "images" / first) if path.exists())
     for path, what in (
         (measured.report, "the test views beside their photos, in a browser"),
         (renders / f"{output_stems([first])[0]}.png", "a rendered test view"),

@@ -204,18 +204,7 @@ def train(
     from clsplat.scenes.reconstruct.photo_files import is_photographs
     from clsplat.training.run import check_start
 
-    if resume and overwrite:
-        raise click.UsageError("give --resume or --overwrite, not both")
-    if scene and source_path and scene != source_path:
-        raise click.UsageError(f"two scenes: {scene} and {source_path}")
-    if allow_changed_photos and not resume:
-        raise click.UsageError("--allow-changed-photos is for --resume")
-    if resume and quality_name is not None:
-        raise click.UsageError("--quality is for new runs: to train longer, give --resume and --iterations")
-    if stay is not None and not view:
-        raise click.UsageError("--stay and --no-stay need --view")
-    if not view and any(is_given(ctx, name) for name in ("port", "host", "names", "token")):
-        raise click.UsageError("--port, --host, --allow-host and --token need --view")
+    _check_flags(ctx)
     path = scene or source_path
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
@@ -283,6 +272,23 @@ def train(
             report(model, known or evaluate_test_views(model.splats, loaded, model.config))
         if live is not None and (sys.stderr.isatty() and not quiet if stay is None else stay):
             _stay(live, model, quiet)
+
+
+def _check_flags(ctx: click.Context) -> None:
+    """Raise UsageError for flags that contradict each other, or that need another flag."""
+    flags = ctx.params
+    if flags["resume"] and flags["overwrite"]:
+        raise click.UsageError("give --resume or --overwrite, not both")
+    if flags["scene"] and flags["source_path"] and flags["scene"] != flags["source_path"]:
+        raise click.UsageError(f"two scenes: {flags['scene']} and {flags['source_path']}")
+    if flags["allow_changed_photos"] and not flags["resume"]:
+        raise click.UsageError("--allow-changed-photos is for --resume")
+    if flags["resume"] and flags["quality_name"] is not None:
+        raise click.UsageError("--quality is for new runs: to train longer, give --resume and --iterations")
+    if flags["stay"] is not None and not flags["view"]:
+        raise click.UsageError("--stay and --no-stay need --view")
+    if not flags["view"] and any(is_given(ctx, name) for name in ("port", "host", "names", "token")):
+        raise click.UsageError("--port, --host, --allow-host and --token need --view")
 
 
 def _stay(live: TrainingSession, model: Model, quiet: bool) -> None:
