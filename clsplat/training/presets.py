@@ -94,7 +94,8 @@ def _gaussian_splatting() -> Values:
     Regularisers and noise are off. The first opacity is 0.1, the first scale the distance to three neighbours.
     A splat densifies if its mean gradient is above 2e-4: it is cloned below 0.01 of the extent, and split above.
 
-    Not included: the opacity reset at iteration 500 over a white background.
+    Not included: the opacity reset at iteration 500 over a white background, and the removal of large splats (reasons
+    in density/adc.py).
     """
     return {"shape": "gaussian"} | _ADAM | _RATES | _CLONE_AND_SPLIT
 

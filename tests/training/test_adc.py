@@ -15,7 +15,7 @@ from clsplat.splats import shapes
 from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import Shape
-from clsplat.training.density.adc import MIN_OPACITY, RESET_OPACITY, WORLD_SIZE, plan_adc, with_reset
+from clsplat.training.density.adc import MIN_OPACITY, RESET_OPACITY, plan_adc, with_reset
 from clsplat.training.density.edit import DensifyEdit
 from clsplat.training.density.halves import SPLIT_SHRINK, split_along_axis, twice
 from clsplat.training.density.table import HostSplats
@@ -61,13 +61,12 @@ def plain(n: int, scale: float, opacity: float = 0.5) -> Arrays:
     dead=st.floats(0, 1),
     spare=st.integers(-20, 150),
     by_axis=st.booleans(),
-    large=st.booleans(),
     turnover=st.sampled_from([0.0, 0.05, 0.5]),
     split=st.sampled_from(SPLITS),
     shape=st.sampled_from(ALL_SHAPES),
 )
 def test_laws_of_a_plan(
-    n: int, seed: int, dead: float, spare: int, by_axis: bool, large: bool, turnover: float, split: str, shape: Shape
+    n: int, seed: int, dead: float, spare: int, by_axis: bool, turnover: float, split: str, shape: Shape
 ) -> None:
     arrays = random_model(shape, n, seed, dead)
     rng = np.random.default_rng(seed)
@@ -76,7 +75,6 @@ def test_laws_of_a_plan(
     options = {
         "depth_threshold": 0.1 if by_axis else 0.0,
         "dense_size": 0.02,
-        "prune_large": large,
         "turnover": turnover,
         "split": split,
     }
@@ -90,8 +88,6 @@ def test_laws_of_a_plan(
     assert all(len(a) == n_new and np.isfinite(a).all() for a in moved.values())
     assert all(np.array_equal(a, again.apply(arrays)[name]) for name, a in moved.items())
     kept = shape.strength(arrays) >= MIN_OPACITY
-    if large:
-        kept &= np.exp(arrays["log_scale"].max(axis=1)) <= WORLD_SIZE * EXTENT
     if kept.any() and (
         split == "long-axis" or not by_axis
     ):  # in 3DSGS a side's opacity may be faint: the next action removes it
@@ -160,20 +156,16 @@ def test_halves_are_drawn_from_the_parents_gaussian() -> None:
     np.testing.assert_allclose(np.cov(drawn.T), sigma, atol=0.02 * sigma.max())
 
 
-def test_pruning_by_opacity_and_after_a_reset_by_size() -> None:
+def test_pruning_by_opacity_and_not_by_size() -> None:
     arrays = plain(4, 1e-3)
     logit = lambda o: math.log(o / (1 - o))  # noqa: E731
     arrays["opacity_logit"][0] = logit(0.9 * MIN_OPACITY)
     arrays["opacity_logit"][1] = logit(1.1 * MIN_OPACITY)
-    arrays["log_scale"][2, 1] = math.log(1.1 * WORLD_SIZE * EXTENT)
-    quiet = stats_of(np.zeros(4))
-    assert edited(arrays, shapes.GAUSSIAN, quiet).source.tolist() == [1, 2, 3]
-    assert edited(arrays, shapes.GAUSSIAN, quiet, prune_large=True).source.tolist() == [1, 3]
-    # A splat that is too large is split if its halves are small enough. A splat that is too faint is never split.
+    arrays["log_scale"][2, 1] = math.log(100 * EXTENT)
+    assert edited(arrays, shapes.GAUSSIAN, stats_of(np.zeros(4))).source.tolist() == [1, 2, 3]
+    # A splat that is too faint is never split.
     loud = stats_of(np.array([1.0, 0.0, 1.0, 0.0]))
-    assert edited(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3, 2, 2]
-    arrays["log_scale"][2, 1] += math.log(SPLIT_SHRINK)
-    assert edited(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3]
+    assert edited(arrays, shapes.GAUSSIAN, loud).source.tolist() == [1, 3, 2, 2]
 
 
 def test_two_sided_splats_live_by_their_stronger_side_and_signed_ones_by_the_absolute() -> None:
@@ -217,32 +209,6 @@ def test_at_the_cap_the_faintest_make_room_for_the_largest_gradients(scale: floa
     assert np.bincount(plan(0.5, cap=8).source).tolist() == [2, 2, 1, 0, 2, 1]
     assert np.bincount(plan(0.5, cap=9).source).tolist() == [2, 2, 1, 1, 2, 1]
     assert plan(0.5, cap=5).source.tolist() == list(range(6))
-
-
-def test_a_turnover_counts_the_two_halves_of_a_splat_that_is_pruned_for_its_size() -> None:
-    arrays = plain(4, 1e-3)
-    arrays["opacity_logit"][:] = (2, 1, 0, -1)
-    arrays["log_scale"][0, 1] = math.log(1.1 * WORLD_SIZE * EXTENT)
-    loud = stats_of(np.array([9, 9, 0, 0]) * THRESHOLD)
-    edit = edited(arrays, shapes.GAUSSIAN, loud, cap=4, turnover=0.5, prune_large=True)
-    assert np.bincount(edit.source, minlength=4).tolist() == [2, 2, 0, 0]
-
-
-def test_a_large_splat_stays_if_the_cap_has_no_room_for_its_halves() -> None:
-    """3DGS would replace it by two halves. To remove it alone would leave a hole."""
-    arrays = plain(4, 1e-3)
-    arrays["log_scale"][:2, 1] = math.log(1.1 * WORLD_SIZE * EXTENT)
-    loud = stats_of(np.array([5, 9, 0, 0]) * THRESHOLD)
-    sources = [edited(arrays, shapes.GAUSSIAN, loud, cap=cap, prune_large=True).source for cap in (4, 5, 6)]
-    assert [np.bincount(source, minlength=4).tolist() for source in sources] == [
-        [1, 1, 1, 1],
-        [1, 2, 1, 1],
-        [2, 2, 1, 1],
-    ]
-    # A large splat that no gradient asks for is removed only if all others that are to be densified have room.
-    quiet = stats_of(np.array([5, 0, 9, 0]) * THRESHOLD)
-    sources = [edited(arrays, shapes.GAUSSIAN, quiet, cap=cap, prune_large=True).source for cap in (4, 5)]
-    assert [np.bincount(source, minlength=4).tolist() for source in sources] == [[1, 1, 1, 1], [2, 0, 2, 1]]
 
 
 def test_what_is_not_finite_goes_and_the_model_is_never_empty() -> None:

@@ -116,14 +116,6 @@ def test_adc_resets_when_3dgs_does() -> None:
     assert [it for it in range(300, 5601, 300) if action(odd, it)[1].reset_fields] == [1200, 2100, 3000, 4200, 5100]
 
 
-def test_adc_looks_at_sizes_after_the_first_reset() -> None:
-    arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
-    arrays["log_scale"][:] = -5
-    arrays["log_scale"][0] = 0  # as large as the scene
-    for iteration, config, kept in ((3000, adc(), True), (3100, adc(), False), (9000, adc(opacity_reset=0), True)):
-        assert (0 in action(config, iteration, arrays=arrays)[1].source) == kept
-
-
 def test_adc_hands_on_its_options() -> None:
     arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
     stats = np.zeros((3, N))

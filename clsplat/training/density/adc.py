@@ -2,10 +2,12 @@
 
 Splats with a high mean screen gradient are densified. A small splat is cloned: it gets a copy in the same place. A
 large splat is split into two halves (halves.py), which are drawn from its Gaussian and smaller by a factor of 1.6.
-Nearly transparent splats are pruned. After the first opacity reset, very large splats are pruned too, if the cap has
-room for the smaller ones that take their place. Sizes are in world units. 3DGS also has a limit on the screen
-(20 px), which has no effect in its released code (graphdeco-inria/gaussian-splatting#123, #643). With few splats that
-limit would remove most of them.
+Nearly transparent splats are pruned.
+
+3DGS also prunes large splats after the first opacity reset: those larger than a tenth of the scene extent, and those
+larger than 20 px on the screen. Neither rule is here. The extent says how far apart cameras are, and walls and skies
+need larger splats if cameras are close together. The limit on the screen has no effect in the released code
+(graphdeco-inria/gaussian-splatting#123, #643).
 
 With a depth threshold (3DSGS, arXiv 2605.18334) a splat is split if either gradient is high, always along its longest
 axis.
@@ -31,12 +33,11 @@ from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, raw_of_optical_depth
 from ...splats.shapes import Shape
 from .edit import DensifyEdit, Indices, NewValues
-from .halves import PUBLISHED_DISTANCE, SPLIT_SHRINK, drawn_halves, halves_along_axis, split_along_axis
+from .halves import PUBLISHED_DISTANCE, drawn_halves, halves_along_axis, split_along_axis
 from .table import SplatTable, smallest
 
 # 3DGS's constants.
 MIN_OPACITY = 0.005  # fainter splats are pruned
-WORLD_SIZE = 0.1  # larger splats are pruned, in scene extents
 RESET_OPACITY = 0.01
 
 
@@ -51,7 +52,6 @@ def plan_adc(
     grad_threshold: float,
     depth_threshold: float = 0.0,
     dense_size: float = 0.01,
-    prune_large: bool = False,
     turnover: float = 0.0,
     split: str = "published",
 ) -> DensifyEdit:
@@ -71,7 +71,6 @@ def plan_adc(
     grad_threshold : threshold of the mean screen gradient.
     depth_threshold : threshold of the mean depth gradient times the extent; 0: not used.
     dense_size : splats larger than this fraction of the extent are split, the others are cloned.
-    prune_large : whether splats larger than WORLD_SIZE are pruned, if the cap has room for all splats to be densified.
     turnover : largest number of splats that are pruned to make room under the cap, the faintest first, as a fraction
         of the cap, 0 to 0.5. It has no effect on more splats than the cap.
     split : "published", or "long-axis": all splats with a high gradient are split along their longest axis.
@@ -88,23 +87,8 @@ def plan_adc(
     rows, score = _above_threshold(stats, grad_threshold, depth_threshold, extent)
     size = summary.log_size[rows].astype(np.float64)
     is_large = by_axis | (size > _log(dense_size * extent))
-
-    def candidates(limit: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which splats are kept, and which of the rows are split and cloned. limit : of the size, in log units.
-
-        A splat above the limit is split if its halves are below it, and counts as kept.
-        """
-        keep = bright & (summary.log_size <= limit) if limit < math.inf else bright.copy()
-        if not keep.any():
-            keep = sound.copy()
-        splits = bright[rows] & is_large & (size - (0.0 if by_axis else math.log(SPLIT_SHRINK)) <= limit)
-        clones = keep[rows] & bright[rows] & ~splits
-        keep[rows[splits]] = True
-        return keep, splits, clones
-
-    keep, splits, clones = candidates(_log(WORLD_SIZE * extent) if prune_large else math.inf)
-    if prune_large and np.count_nonzero(keep) + np.count_nonzero(splits | clones) > cap:
-        keep, splits, clones = candidates(math.inf)
+    splits, clones = bright[rows] & is_large, bright[rows] & ~is_large
+    keep = bright if bright.any() else sound
     if turnover and len(keep) <= cap:
         missing = int(np.count_nonzero(keep) + np.count_nonzero(splits | clones) - cap)
         among = np.flatnonzero(keep)

@@ -79,7 +79,6 @@ def next_edit(
             split=density.split,
             gradient=stats[SplatStatistics.SCREEN_GRADIENT] / np.maximum(stats[SplatStatistics.TIMES_SEEN], 1.0),
         )
-    every = reset_interval(density, config.iterations)
     grown = plan_adc(
         splats,
         shape,
@@ -92,7 +91,6 @@ def next_edit(
         dense_size=density.dense_size,
         turnover=turnover(config),
         split=density.split,
-        prune_large=0 < every < info.iteration,
     )
     return with_reset(grown, splats, shape) if resets(config, density, info) else grown
 
