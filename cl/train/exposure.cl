@@ -2,9 +2,9 @@
 //
 // The exposure E of a photo is 12 reals, three rows with three factors and an offset: photo = E (r, g, b, 1), where r,
 // g and b are colours of the render. A pixel that a mask hides has neither an error nor a gradient. A transparent pixel
-// of a photo is composited over the background of the render. The truth has planes of bytes: r, g, b, and with 5
-// channels also the mask (0 hides) and the opacity. A work-item computes PHOTO_VECS vectors of a row. Images are planar
-// with a zero margin (rasterize.cl).
+// of a photo is composited over the background of the render, which has no exposure. The truth has planes of bytes: r,
+// g, b, and with 5 channels also the mask (0 hides) and the opacity. A work-item computes PHOTO_VECS vectors of a row.
+// Images are planar with a zero margin (rasterize.cl).
 
 #define EXPOSURE 12
 #define SQUARES 10  // entries of the upper triangle of a 4 x 4 matrix, by rows
@@ -28,9 +28,14 @@ static inline vmask counted(global const uchar *truth, ulong plane, int channels
     return channels > 3 ? inside & (lanes_uchar_to_real(truth + 3 * plane) > (vreal)0) : inside;
 }
 
+// The part of the background in the pixels of a photo, 0 to 1.
+static inline vreal transparency(global const uchar *truth, ulong plane, int channels) {
+    return channels > 3 ? (vreal)1 - lanes_uchar_to_real(truth + 4 * plane) * BYTE_STEP : (vreal)0;
+}
+
 // Overwrites photo [3 planes] with the render under the exposure of the photo. With 5 channels it also overwrites
-// target [3 planes of bytes] with the truth over the background of the render. shift: background of the render minus
-// background of the truth, times 255.
+// target [3 planes of bytes] with the truth over the background of the render. back: that background. shift: it minus
+// the background of the truth, times 255.
 // Global size: (at least the vectors of a row / PHOTO_VECS, height).
 kernel void photo_of_render(
     global const real *restrict color,
@@ -44,6 +49,9 @@ kernel void photo_of_render(
     int height,
     int stride,
     ulong plane,
+    real back_r,
+    real back_g,
+    real back_b,
     real shift_r,
     real shift_g,
     real shift_b
@@ -51,8 +59,13 @@ kernel void photo_of_render(
     const row_part item = item_part(width);
     const int y = get_global_id(1);
     global const real *row = exposures + EXPOSURE * view;
-    const real shift[3] = {shift_r, shift_g, shift_b};
+    const real back[3] = {back_r, back_g, back_b}, shift[3] = {shift_r, shift_g, shift_b};
     const vreal zero = (vreal)0;
+    real behind[3];  // what the exposure took from the background
+    for (int c = 0; c < 3; ++c) {
+        global const real *e = row + 4 * c;
+        behind[c] = back[c] - (e[0] * back_r + e[1] * back_g + e[2] * back_b + e[3]);
+    }
     if (y >= height) return;
     for (int vec = item.first; vec < item.end; ++vec) {
         const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
@@ -60,10 +73,11 @@ kernel void photo_of_render(
                     counts = counted(truth + at, plane, channels, vec, width);
         const vreal r = lanes_load(color + at), g = lanes_load(color + at + plane),
                     b = lanes_load(color + at + 2 * plane);
-        const vreal through = channels > 3 ? (vreal)1 - lanes_uchar_to_real(truth + at + 4 * plane) * BYTE_STEP : zero;
+        const vreal through = transparency(truth + at, plane, channels);
         for (int c = 0; c < 3; ++c) {
             global const real *e = row + 4 * c;
             vreal shown = lanes_mad(r, (vreal)e[0], lanes_mad(g, (vreal)e[1], lanes_mad(b, (vreal)e[2], (vreal)e[3])));
+            shown = lanes_mad(through, (vreal)behind[c], shown);
             if (channels > 3) {
                 vreal aim = lanes_mad(through, (vreal)shift[c], lanes_uchar_to_real(truth + at + c * plane));
                 aim = lanes_if(inside, rint(lanes_clamp(aim, 0, 255)), zero);
@@ -76,8 +90,9 @@ kernel void photo_of_render(
 }
 
 // Changes v [3 planes] from the gradient of the photo to the gradient of the render. Overwrites partial [SUMS, parts]
-// with the sums of x x' and y x'. Here x is (r, g, b, 1) of the render and y is the target. The sums include the pixels
-// that are neither hidden nor saturated. With 3 channels the target is the truth. Global size: that of photo_of_render.
+// with the sums of x x' and y x'. Here x is what the exposure multiplies and y is the target, without its background.
+// The sums include the pixels that are neither hidden, transparent nor saturated. With 3 channels the target is the
+// truth. Global size: that of photo_of_render.
 kernel void photo_of_render_vjp(
     global const real *restrict color,
     global const uchar *restrict truth,
@@ -90,11 +105,15 @@ kernel void photo_of_render_vjp(
     int width,
     int height,
     int stride,
-    ulong plane
+    ulong plane,
+    real back_r,
+    real back_g,
+    real back_b
 ) {
     const row_part item = item_part(width);
     const int y = get_global_id(1);
     global const real *row = exposures + EXPOSURE * view;
+    const real back[3] = {back_r, back_g, back_b};
     const vreal zero = (vreal)0;
     vreal sums[SUMS];
     for (int j = 0; j < SUMS; ++j) sums[j] = zero;
@@ -102,11 +121,13 @@ kernel void photo_of_render_vjp(
     for (int vec = item.first; vec < item.end; ++vec) {
         const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
         const vmask counts = counted(truth + at, plane, channels, vec, width);
+        const vreal through = transparency(truth + at, plane, channels);
         vreal x[4], v_photo[3], aim[3], brightest = zero;
         for (int c = 0; c < 3; ++c) {
-            x[c] = lanes_load(color + at + c * plane);
+            x[c] = lanes_load(color + at + c * plane) - through * (vreal)back[c];
             aim[c] = lanes_uchar_to_real(target + at + c * plane) * BYTE_STEP;
             brightest = max(brightest, aim[c]);
+            aim[c] -= through * (vreal)back[c];
             v_photo[c] = lanes_if(counts, lanes_load(v + at + c * plane), zero);
         }
         for (int c = 0; c < 3; ++c)
@@ -116,8 +137,9 @@ kernel void photo_of_render_vjp(
                 ),
                 v + at + c * plane
             );
-        x[3] = lanes_if(counts & (brightest < (vreal)SATURATED), (vreal)1, zero);
-        for (int c = 0; c < 3; ++c) x[c] *= x[3];
+        x[3] = (vreal)1 - through;
+        const vmask fitted = counts & (through < (vreal)1) & (brightest < (vreal)SATURATED);
+        for (int c = 0; c < 4; ++c) x[c] = lanes_if(fitted, x[c], zero);
         int j = 0;
         for (int a = 0; a < 4; ++a)
             for (int b = a; b < 4; ++b, ++j) sums[j] = lanes_mad(x[a], x[b], sums[j]);

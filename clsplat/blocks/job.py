@@ -56,7 +56,8 @@ def train_block(
     """
     inside, context = Splats.load(job.folder / INSIDE), Splats.load(job.folder / CONTEXT)
     exposures = exposures_of_start(str(job.folder / START)) if job.config.appearance.exposure else {}
-    scene = with_photos(replace(scene, background=job.config.background), job.config)  # as the run decided
+    background = job.config.background  # as the run decided
+    scene = replace(with_photos(scene, job.config), background=background)
     prepared = with_block_targets(scene, inside, context, Renderer(device), job.uncovered, exposures)
     return train_in_folder(job.config.replace(device=device), prepared, folder, context, progress, visit)
 

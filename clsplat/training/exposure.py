@@ -1,10 +1,11 @@
 """The loss against real photos: exposure compensation, masks, and transparency over random backgrounds.
 
-The exposure of a photo is an affine map from the colours of the render to the colours of the photo, as in 3DGS. Each
-time a view is trained, its exposure moves a fixed fraction towards the least-squares fit of the current render. The
-mean over all views is kept at the identity, which is also used for novel views. 3DGS learns exposures by Adam instead;
-the comparison is in docs/decisions.md. A run that begins with a model begins with the exposures of that model. Runs
-without exposures, masks and transparency launch none of these kernels.
+The exposure of a photo is an affine map from the colours of the render to the colours of the photo, as in 3DGS. It does
+not change the background behind a transparent photo, which no camera took. Each time a view is trained, its exposure
+moves a fixed fraction towards the least-squares fit of the current render. The mean over all views is kept at the
+identity, which is also used for novel views. 3DGS learns exposures by Adam instead; the comparison is in
+docs/decisions.md. A run that begins with a model begins with the exposures of that model. Runs without exposures, masks
+and transparency launch none of these kernels.
 """
 
 from __future__ import annotations
@@ -80,6 +81,7 @@ class ExposureLoss:
             "height": layout.height,
             "stride": layout.stride,
             "plane": layout.plane,
+            **{f"back_{color}": value for color, value in zip("rgb", background, strict=True)},
         }
         self.program.photo_of_render.over(
             items,

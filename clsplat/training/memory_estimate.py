@@ -118,7 +118,7 @@ def run_memory(device: Device, kernels: KernelBuild, config: TrainConfig, views:
     """Return the memory estimate of a run on these views. Raise DeviceError if the device has too little memory."""
     largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
     layout = ImageLayout(largest.width, largest.height)
-    channels = target_channels(views, config.random_background)
+    channels = target_channels(views, config)
     images = target_bytes(views, target_budget(device), channels)
     images += exposure_bytes(layout, kernels.dtype.itemsize, config, channels)
     needed = estimate(config, kernels, layout, images)

@@ -61,7 +61,7 @@ class Replica:
         self.loss = ImageLoss(self.pipeline.pool, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)
         check_loss(device, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)
         check_step(device, kernels, config.sghmc.position_optimizer)
-        channels = target_channels(scene.train, config.random_background)
+        channels = target_channels(scene.train, config)
         self.targets = Targets(device, kernels, scene.train, target_budget(device), channels)
         self.exposure = ExposureLoss(self.loss, self.targets, config, config.background)
         self.dropout = SplatDropout(config, self.splats)

@@ -1,7 +1,7 @@
 """Target images: the training photos as 8-bit planes, which stay on the device if they fit a memory budget.
 
-The planes are r, g, b. Two more planes follow if any view has a mask, or transparency with random backgrounds: the mask
-and the opacity.
+The planes are r, g, b. Two more planes follow if any view has a mask, or transparency with random backgrounds or
+exposures: the mask and the opacity.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ..files.images import ImageU8
 from ..rendering.build import KernelBuild
 from ..rendering.frame import ImageLayout
 from ..scenes.scene import View
+from .config import TrainConfig
 from .programs import loss_program
 
 _COLOR, _WITH_MASKS = 3, 5  # planes
@@ -164,8 +165,9 @@ def reduced_camera(camera: Camera, downscale: int) -> Camera:
     return camera.resized(max(camera.width // downscale, 1), max(camera.height // downscale, 1))
 
 
-def target_channels(views: Sequence[View], with_alpha: bool) -> int:
-    """Return the number of planes that the views need. with_alpha : the run uses the transparency of the photos."""
+def target_channels(views: Sequence[View], config: TrainConfig) -> int:
+    """Return the number of planes that the views need in a run."""
+    with_alpha = config.random_background or config.appearance.exposure
     more = any(view.mask is not None or (with_alpha and view.alpha is not None) for view in views)
     return _WITH_MASKS if more else _COLOR
 

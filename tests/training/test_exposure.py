@@ -46,6 +46,15 @@ def laid_over(image: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.
     return np.clip(image + 255 * through * (np.array(NEW) - np.array(BEHIND)), 0, 255)
 
 
+def opacity(view: View) -> NDArray[np.uint8]:
+    return np.full(view.image.shape[:2], 255, np.uint8) if view.alpha is None else view.alpha
+
+
+def transparency(view: View) -> NDArray[np.float64]:
+    """Return the part of the background in each pixel, (H, W, 1)."""
+    return 1 - opacity(view)[:, :, None] / 255
+
+
 def views_of(masks: bool, alphas: bool) -> list[View]:
     rng = np.random.default_rng(3)
     views = []
@@ -56,6 +65,7 @@ def views_of(masks: bool, alphas: bool) -> list[View]:
         if alpha is not None:  # no colour may lie halfway between two bytes
             halfway = np.abs(laid_over(image, alpha) % 1 - 0.5) < 1e-3
             alpha[halfway.any(axis=2)] = 255
+            alpha[:, 0] = 0
         views.append(
             View(f"{i}.png", Camera(width, height, 25.0, 26.0, width / 2, height / 2, np.eye(4)), image, mask, alpha)
         )
@@ -67,17 +77,20 @@ def exposure_loss(device: Device, schedule: Schedule, real: Real, views: list[Vi
         pytest.skip("no double precision")
     kernels = KernelBuild("gaussian", 0, schedule, real=real)
     config = TrainConfig(exposure=exposure, random_background=True, iterations=100)
-    targets = Targets(device, kernels, views, 10**9, target_channels(views, with_alpha=True))
+    targets = Targets(device, kernels, views, 10**9, target_channels(views, config))
     return ExposureLoss(ImageLoss(Pool(device), kernels, 0.2), targets, config, BEHIND)
 
 
 def wanted_of(
     color: NDArray[np.float64], exposure: NDArray[np.float64], view: View
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the render with the photo's exposure, and the photo over the render's background; both (H, W, 3)."""
-    shown = color @ exposure[:, :3].T + exposure[:, 3]
-    opaque = np.full(view.image.shape[:2], 255, np.uint8)
-    laid = np.rint(laid_over(view.image, opaque if view.alpha is None else view.alpha)) / 255
+    """Return the render with the photo's exposure, and the photo over the render's background; both (H, W, 3).
+
+    The exposure does not change the background.
+    """
+    through = transparency(view)
+    shown = (color - through * NEW) @ exposure[:, :3].T + (1 - through) * exposure[:, 3] + through * NEW
+    laid = np.rint(laid_over(view.image, opacity(view))) / 255
     return shown if view.mask is None else np.where(view.mask[:, :, None], shown, laid), laid
 
 
@@ -89,16 +102,16 @@ def gradient_of(color: NDArray[np.float64], exposure: NDArray[np.float64], view:
 
 def best_exposure(color: NDArray[np.float64], view: View, pull: float) -> NDArray[np.float64]:
     """Return the (3, 4) least-squares exposure. Additional rows pull it to the identity."""
-    laid = wanted_of(color, np.eye(3, 4), view)[1]
-    counts = laid.max(axis=2) < 0.98
+    laid, through = wanted_of(color, np.eye(3, 4), view)[1], transparency(view)
+    counts = (laid.max(axis=2) < 0.98) & (through[:, :, 0] < 1)
     if view.mask is not None:
         counts &= view.mask
-    n = counts.sum()
-    if not n:
+    if not counts.any():
         return np.eye(3, 4)
-    weight = np.sqrt(pull * n)
-    inputs = np.vstack([np.column_stack([color[counts], np.ones(n)]), weight * np.eye(4)])
-    outputs = np.vstack([laid[counts], weight * np.eye(3, 4).T])
+    opaque = (1 - through)[counts]
+    weight = np.sqrt(pull * np.square(opaque).sum())
+    inputs = np.vstack([np.column_stack([(color - through * NEW)[counts], opaque]), weight * np.eye(4)])
+    outputs = np.vstack([(laid - through * NEW)[counts], weight * np.eye(3, 4).T])
     return np.linalg.lstsq(inputs, outputs, rcond=None)[0].T
 
 
@@ -164,6 +177,14 @@ def test_gradients_and_step_equal_the_reference(
         exposures -= moved / len(views)
         np.testing.assert_allclose(exposure.exposures(), exposures, atol=1e-9 if real == "double" else 2e-5)
     np.testing.assert_allclose(exposure.exposures().mean(axis=0), some_exposures(len(views)).mean(axis=0), atol=1e-6)
+
+
+def test_exposures_and_random_backgrounds_need_the_opacity_of_photos() -> None:
+    photos, opaque = views_of(False, True), views_of(False, False)
+    assert target_channels(photos, TrainConfig(exposure=True)) == 5
+    assert target_channels(photos, TrainConfig(random_background=True)) == 5
+    assert target_channels(photos, TrainConfig()) == 3
+    assert target_channels(opaque, TrainConfig(exposure=True, random_background=True)) == 3
 
 
 def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
