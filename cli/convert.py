@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 @click.option(
     "--approximate",
     is_flag=True,
-    help="Use the nearest Gaussian for splats without an equal one, and measure the loss.",
+    help="Use the nearest splat of the shape where none is equal, and measure the loss.",
 )
 @click.option(
     "--sh-degree",

@@ -16,7 +16,7 @@ from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
 from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
-from ..splats.approximate import nearest_gaussians
+from ..splats.approximate import nearest_of_shape
 from ..splats.convert import as_one_of, convert
 from ..splats.fields import sh_coefficients
 from ..splats.formats.any_file import SPZ_ENDING, WRITTEN, WrittenFormat, check_ending, format_of
@@ -39,7 +39,7 @@ class ConvertedModel:
     ----------
     source : the model before. output : the file that was written.
     splats : the model after, before the file rounded it.
-    approximate : True if the splats are only the nearest Gaussians.
+    approximate : True if the splats are only the nearest ones of their shape.
     levels : the coarser levels of detail of a streamed SOG, the finest first.
     """
 
@@ -134,7 +134,7 @@ def convert_model(
         .html page that draws the splats; or a file lod-meta.json, which gets the chunks of a streamed SOG beside it.
     shape : the shape to convert to; by default the model's, or an equal one that the format holds: Gaussians, in .glb
         and USD files and pages skew-normals and generalised exponentials too.
-    approximate : use the nearest Gaussian for splats without an equal one, instead of raising.
+    approximate : use the nearest splat of the shape for splats without an equal one, instead of raising.
     sh_degree : remove the SH bands above, or add bands of zeros.
     spz_version : version of an .spz file, 3 or 4. Version 4 needs the extra `spz`.
     levels : number of levels of detail of a streamed SOG, 1 to 8; by default 4.
@@ -238,9 +238,9 @@ def _write_levels(output: Path, splats: Splats, levels: int) -> list[Splats]:
 
 
 def _as_shape(splats: Splats, target: str | None, suffix: str, approximate: bool) -> tuple[Splats, bool]:
-    """Return the splats as `target`, and whether they are only the nearest Gaussians.
+    """Return the splats as `target`, and whether they are only the nearest ones of that shape.
 
-    Without a target, they get an equal shape that files of this ending hold.
+    Without a target, they get an equal shape that files of this ending hold, or become Gaussians.
     """
     shapes = WRITTEN[suffix].shapes
     try:
@@ -249,11 +249,9 @@ def _as_shape(splats: Splats, target: str | None, suffix: str, approximate: bool
         holder = "a page draws" if suffix == PAGE_ENDING else f"a {suffix} file holds"
         return (splats if shapes is None else as_one_of(splats, shapes, holder)), False
     except InputError as error:
-        if target not in (None, GAUSSIAN.name):
-            raise
         if not approximate:
             raise InputError(f"{error}; or --approximate") from None
-    return nearest_gaussians(splats), True
+    return nearest_of_shape(splats, target or GAUSSIAN.name)
 
 
 def _of_degree(splats: Splats, degree: int) -> Splats:

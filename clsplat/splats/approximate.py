@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .convert import convert, direct_form, restretched, to_world
+from .convert import convert, direct_form, longest_slant, restretched, to_world
 from .fields import DoubleArray, Field
 from .shapes import GAUSSIAN, NORMALISATIONS, SLANT_MAX, Shape, shape_named
 from .splats import Splats
@@ -39,6 +39,31 @@ _MIN_ALPHA = 1.0 / 255.0
 _STEPS = 60  # limit of Gauss-Newton steps
 _CONVERGED = 1e-9  # Gauss-Newton ends at a smaller step
 _RAW_MAX = 80.0  # the logistic function of a larger raw opacity is 1 in float64
+
+
+def nearest_of_shape(splats: Splats, shape: str) -> tuple[Splats, bool]:
+    """Return the nearest splats of another shape, and whether their images differ.
+
+    Without an equal of all splats, skews that the other form of the skew-normal cannot have are shortened. Other splats
+    become the splats of the shape that equal their nearest Gaussians. Those of negative opacity are left out then.
+
+    Raises
+    ------
+    InputError : the shape is unknown, or the normalisation of skew-normals is not "peak".
+    """
+    try:
+        return convert(splats, shape), False
+    except InputError:
+        if shape_named(splats.shape).normalised and shape_named(shape).normalised:
+            return convert(_with_short_skews(splats), shape), True
+        return convert(nearest_gaussians(splats), shape), True
+
+
+def _with_short_skews(splats: Splats) -> Splats:
+    """Return splats of the direct form, with skews no longer than those that the centred form can have."""
+    length = np.linalg.norm(splats.skew.astype(np.float64), axis=1, keepdims=True)
+    short = np.minimum(1.0, longest_slant() / np.maximum(length, 1e-300)) * splats.skew
+    return splats.with_arrays(splats.to_numpy() | {"skew": short.astype(splats.skew.dtype)})
 
 
 def nearest_gaussians(splats: Splats) -> Splats:

@@ -100,13 +100,18 @@ def _centred(model: ArraysByField, target: Shape) -> ArraysByField:
         2.0 / math.pi * squared / (1.0 + squared)
     )  # the share of the variance along the slant that the skew removes
     length = np.sqrt(removed / (1.0 - removed))
-    k = _displaced(SKEW_MAX**2)
-    longest = math.sqrt(k / (1.0 - k))
-    _refuse(length[:, 0] > SKEW_MAX * (1.0 + LIMIT_SLACK), target, f"have a skew above {longest:.3f}", "shorten it")
+    too_long = length[:, 0] > SKEW_MAX * (1.0 + LIMIT_SLACK)
+    _refuse(too_long, target, f"have a skew above {longest_slant():.3f}", "shorten it")
     unit = slant / np.sqrt(np.maximum(squared, 1e-300))
     frame, turned = restretched(model, unit, np.sqrt(1.0 - removed))
     shift = to_world(model, unit * np.sqrt(removed))
     return model | frame | {"mean": model["mean"] + shift, "skew": turned * np.minimum(length, SKEW_MAX)}
+
+
+def longest_slant() -> float:
+    """Return the largest skew of the direct form that the centred form can have, too."""
+    k = _displaced(SKEW_MAX**2)
+    return float(math.sqrt(k / (1.0 - k)))
 
 
 def _displaced(t: DoubleArray | float) -> DoubleArray | float:

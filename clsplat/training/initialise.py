@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.stop_signals import held
+from ..splats.approximate import nearest_of_shape
 from ..splats.fields import Array, sh_coefficients
 from ..splats.formats.any_file import READ_ENDINGS
 from ..splats.morton import morton_order
@@ -245,7 +246,12 @@ def _from_model(
         keep = np.sort(np.argsort(-strength, kind="stable")[:cap])
         message = f"{cap} splats from {path}: the most opaque of {len(loaded)}"
         loaded = loaded.select(keep)
-    arrays = loaded.as_shape(shape).to_numpy()
+    converted, is_nearest = nearest_of_shape(loaded, shape)
+    if is_nearest:
+        message += f", as the nearest {shape} splats"
+    if left_out := len(loaded) - len(converted):
+        message += f", without {left_out} of negative opacity"
+    arrays = converted.to_numpy()
     arrays["sh"] = _fit_bands(arrays["sh"], sh_coefficients(sh_degree))
     return Splats(shape, arrays, normalisation, loaded.antialiased), message
 

@@ -11,8 +11,8 @@ from reference.scenes import for_shape, random_camera, random_splats
 from scipy.special import ndtr
 
 from clsplat.errors import InputError
-from clsplat.splats.approximate import line_fits, nearest_gaussians
-from clsplat.splats.convert import convert
+from clsplat.splats.approximate import line_fits, nearest_gaussians, nearest_of_shape
+from clsplat.splats.convert import convert, longest_slant
 from clsplat.splats.formats.dot_splat import RECORD
 from clsplat.splats.harmonics import SH_C0
 from clsplat.splats.shapes import SHAPES, SKEW_MAX, SLANT_MAX
@@ -201,3 +201,31 @@ def test_sizes_that_no_number_can_hold_spoil_nothing(tmp_path: Path, shape: str)
     others = np.delete(np.arange(len(splats)), [1, 2])
     for name, values in nearest_gaussians(splats).select(others).to_numpy().items():
         np.testing.assert_array_equal(damaged.select(others).to_numpy()[name], values, err_msg=name)
+
+
+def test_the_nearest_of_another_shape_equals_the_nearest_gaussians() -> None:
+    splats = skewed()
+    other, differs = nearest_of_shape(splats, "student-t")
+    assert (other.shape, differs) == ("student-t", True)
+    back = convert(other, "gaussian")
+    gaussians = nearest_gaussians(splats)
+    for name, values in gaussians.arrays.items():
+        np.testing.assert_allclose(back.arrays[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
+    assert not nearest_of_shape(skewed(), "skew-normal-direct")[1]
+    assert not nearest_of_shape(gaussians, "half-gaussian")[1]
+    signed = other.with_arrays(other.to_numpy() | {"opacity_logit": np.linspace(-1, 1, len(other))})
+    assert len(nearest_of_shape(signed, "gaussian")[0]) == len(other) // 2
+
+
+def test_a_skew_that_the_other_form_cannot_have_is_shortened_and_others_stay() -> None:
+    direct = skewed(0.5, "skew-normal-direct")
+    arrays = direct.to_numpy()
+    arrays["skew"][2] *= 0.5 * (longest_slant() + SLANT_MAX) / np.linalg.norm(arrays["skew"][2])
+    with pytest.raises(InputError, match="1 of 12 splats have a skew above"):
+        convert(direct.with_arrays(arrays), "skew-normal")
+    found, differs = nearest_of_shape(direct.with_arrays(arrays), "skew-normal")
+    assert differs
+    assert np.linalg.norm(found.skew[2]) == pytest.approx(SKEW_MAX, rel=1e-4)
+    others, expected = np.arange(12) != 2, convert(direct, "skew-normal")
+    for name, values in expected.arrays.items():
+        np.testing.assert_allclose(found.arrays[name][others], values[others], rtol=1e-5, atol=1e-6, err_msg=name)

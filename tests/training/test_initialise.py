@@ -12,6 +12,8 @@ import pytest
 
 from clsplat.cameras.camera import Camera
 from clsplat.errors import InputError
+from clsplat.splats.approximate import nearest_gaussians
+from clsplat.splats.convert import convert
 from clsplat.splats.morton import morton_order
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
@@ -178,6 +180,30 @@ def test_a_gaussian_model_becomes_another_shape_and_degree(tmp_path: Path, degre
     assert not splats.sh[:, shared:].any()
     assert splats.skew.any(axis=1).all()
     assert "model.ply" in message
+
+
+def test_a_model_of_another_shape_keeps_its_images_or_becomes_the_nearest(tmp_path: Path) -> None:
+    skew = np.tile([0.0, 0.5, 0.0], (12, 1))
+    model = saved(tmp_path / "model.ply", "skew-normal", skew)
+    direct = convert(model, "skew-normal-direct")
+    direct.save(tmp_path / "direct.ply")
+    splats, message = initial_splats(scene(0), init=str(tmp_path / "direct.ply"))
+    assert "nearest" not in message
+    for name in ("mean", "skew", "log_scale"):
+        values = convert(direct, "skew-normal").arrays[name]
+        np.testing.assert_allclose(splats.arrays[name], values, rtol=1e-4, atol=1e-5, err_msg=name)
+    gaussians, message = initial_splats(scene(0), "gaussian", init=str(tmp_path / "direct.ply"))
+    assert message.endswith("as the nearest gaussian splats")
+    np.testing.assert_allclose(gaussians.mean, nearest_gaussians(model).mean, rtol=1e-4, atol=1e-5)
+
+
+def test_a_model_with_negative_opacities_loses_them_for_a_shape_without(tmp_path: Path) -> None:
+    arrays = saved(tmp_path / "model.ply", "gaussian").to_numpy()
+    raw = np.where(np.arange(12) % 3, 0.8, -0.8)
+    Splats("student-t", arrays | {"opacity_logit": raw}).save(tmp_path / "model.ply")
+    splats, message = initial_splats(scene(0), "gaussian", init=str(tmp_path / "model.ply"))
+    assert len(splats) == 8
+    assert "without 4 of negative opacity" in message
 
 
 def test_a_larger_model_keeps_its_most_opaque_and_its_skew(tmp_path: Path) -> None:
