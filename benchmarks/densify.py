@@ -112,6 +112,7 @@ def measure(device: Device, action: str, shape: Shape, n: int, repeats: int) -> 
             statistics_,
             np.random.default_rng(seed),
             EXTENT,
+            1,
         )
         device.finish()
         with recorded(device) as launches:

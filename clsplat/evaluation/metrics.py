@@ -107,7 +107,9 @@ def color_corrected(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | 
 
 
 def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True, mask: NDArray[np.bool_] | None = None) -> float:
-    """Return the peak signal-to-noise ratio [dB] over channels and pixels that count; infinite for equal images.
+    """Return the peak signal-to-noise ratio [dB] over channels and pixels that count.
+
+    It is infinite for equal images, and if no pixel counts.
 
     Parameters
     ----------
@@ -120,8 +122,8 @@ def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True, mask: NDArray[n
     InputError : different or empty shapes.
     """
     x, y = _pair(a, b, rounded)
-    squares = (x - y) ** 2
-    error = float(np.mean(squares if mask is None else squares[mask]))
+    squares = ((x - y) ** 2)[... if mask is None else mask]
+    error = float(np.mean(squares)) if squares.size else 0.0
     return float("inf") if error == 0.0 else -10.0 * float(np.log10(error))
 
 

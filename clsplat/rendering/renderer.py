@@ -123,7 +123,10 @@ class Renderer:
         InputError : `background` is not three finite numbers.
         DeviceError : the device does not have the memory.
         """
-        rgb = np.asarray(background, np.float64)
+        try:
+            rgb = np.asarray(background, np.float64)
+        except (TypeError, ValueError):
+            rgb = np.full(3, np.nan)
         if rgb.shape != (3,) or not np.all(np.isfinite(rgb)):
             raise InputError(f"background {background!r}: expected three finite numbers R, G, B")
         with self._lock:

@@ -73,6 +73,11 @@ class Checkpoint:
     average: dict[str, NDArray[Any]] = field(default_factory=dict)
     left_out: list[int] = field(default_factory=list)
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether it is the end of its run. Then the run that goes on from it is a longer one."""
+        return bool(self.iteration >= self.config["iterations"])
+
     def save(self, path: Path) -> None:
         """Write the checkpoint to a file. If that fails, raise OutputError and keep the old file."""
         meta = {

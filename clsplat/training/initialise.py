@@ -92,8 +92,8 @@ def initial_splats(
     seed : seed of random points and of the first skew.
     random_share : number of random points that are added to those of "sfm", as a fraction of the cap. Without points
         of the scene it is the number of all points, and 0 stands for the whole cap, at most RANDOM_POINTS. None is 0.
-    opacity, scale_factor : properties of splats from points. The scale is the factor times the mean distance to the
-        three nearest points.
+    opacity, scale_factor : properties of splats from points. The scale is the factor times the root mean
+        square of the distances to the three nearest points.
 
     Raises
     ------

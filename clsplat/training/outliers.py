@@ -77,6 +77,8 @@ class OutlierCheck:
         names = self.left_out
         if not self.is_new:
             return ""
+        if not names:
+            return "no photo disagrees with all others any more: the run goes on with all of them"
         some = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
         return (
             f"{len(names)} of {len(self.views)} photos disagree with all others, as with wrong poses: {some}; the run "

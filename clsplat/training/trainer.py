@@ -21,7 +21,6 @@ from ..rendering.frame import Frame
 from ..rendering.renderer import Renderer
 from ..rendering.tuning import schedule_for
 from ..scenes.scene import Scene, View
-from ..scenes.split import with_validation
 from ..splats.fields import Array
 from ..splats.optical_depth import finite_rows
 from ..splats.splats import Splats
@@ -44,7 +43,7 @@ from .model import Model
 from .occluders import OccluderCheck
 from .optim.optimizer import make_optimizer
 from .outliers import OutlierCheck
-from .photos import with_photos
+from .photos import of_run, with_photos
 from .programs import kernel_build
 from .rate_limits import check_rates
 from .replica import Replica
@@ -87,8 +86,7 @@ class Trainer:
     ) -> None:
         check_context(context, config, checkpoint)
         self.context = context
-        if config.validation.validate and not scene.validation_names:
-            scene = with_validation(scene)
+        scene = of_run(scene, config)
         if not scene.train:
             raise InputError(f"{scene.path}: no training views: all are test views")
         check_sizes(
@@ -137,6 +135,7 @@ class Trainer:
             self.pipeline.statistics,
             self.rng,
             scene.extent,
+            len(scene.train),
             self.frozen,
         )
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
@@ -145,9 +144,8 @@ class Trainer:
         self.renderer = Renderer(self.device, schedule=self.kernels.schedule)
         self.occluders = OccluderCheck(config, scene.train, self.renderer, self.density, self.average.begin)
         self.outliers = OutlierCheck(config, scene.train, self.renderer, self.views)
-        self.validation = RunValidation(
-            self.renderer, scene.validation, config.background, config.iterations, config.output.save_iterations
-        )
+        after_end = checkpoint is not None and checkpoint.is_finished
+        self.validation = RunValidation(self.renderer, scene.validation, config, after_end)
         self.evaluations: dict[int, Evaluation] = {}
         self.evaluation_seconds: dict[int, float] = {}
 
@@ -204,8 +202,8 @@ class Trainer:
                 start = time.perf_counter()
                 self.step()
                 it = self.iteration
-                if self.outliers.is_due(it) and (names := self.outliers.left_out):
-                    log.write({"iteration": it, "left_out": names})
+                if self.outliers.is_due(it) and (self.outliers.is_new or self.outliers.left_out):
+                    log.write({"iteration": it, "left_out": self.outliers.left_out})
                     self._send(self.outliers.message)
                 if self.progress is not None:
                     self.clock.end(it)

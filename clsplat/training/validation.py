@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from ..evaluation.evaluate import evaluate
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
-from ..splats.color import Color
 from ..splats.splats import Splats
+from .config import TrainConfig
 from .folder import ModelFolder
 from .log import RunLog
 
@@ -34,15 +34,13 @@ class RunValidation:
     Parameters
     ----------
     views : validation views; without any, nothing is ever due.
-    iterations : length of the run.
-    kept : iterations whose point clouds stay, because the caller asked for them.
+    after_end : whether the run makes a finished one longer. Then the best point cloud of that run stays.
     """
 
-    def __init__(
-        self, renderer: Renderer, views: list[View], background: Color, iterations: int, kept: tuple[int, ...]
-    ) -> None:
-        self.renderer, self.views, self.background = renderer, views, background
-        self.iterations, self.kept = iterations, {*kept, iterations}
+    def __init__(self, renderer: Renderer, views: list[View], config: TrainConfig, after_end: bool = False) -> None:
+        self.renderer, self.views, self.background = renderer, views, config.background
+        self.iterations, self.after_end = config.iterations, after_end
+        self.kept = {*config.output.save_iterations, config.iterations}
         self.best = self.last = Measurement()
 
     def is_due(self, iteration: int) -> bool:
@@ -51,16 +49,14 @@ class RunValidation:
         return bool(self.views) and (iteration % every == 0 or iteration == self.iterations)
 
     def resume(self, folder: ModelFolder, iteration: int) -> None:
-        """Continue after an iteration: the best measurement is that of the log whose point cloud is still there.
-
-        It stays, because it may be the result of a shorter run.
-        """
+        """Continue after an iteration: the best measurement is that of the log whose point cloud is still there."""
         stored = set(folder.iterations())
         for measured in _logged(folder, iteration):
             self.last = measured
             if measured.psnr > self.best.psnr and measured.iteration in stored:
                 self.best = measured
-        self.kept.add(self.best.iteration)
+        if self.after_end:
+            self.kept.add(self.best.iteration)
 
     def measure(self, splats: Splats, iteration: int, seconds: float, log: RunLog, folder: ModelFolder | None) -> None:
         """Measure the splats of an iteration. The best point cloud so far replaces the one before.

@@ -157,3 +157,9 @@ def test_evaluate_returns_means_and_finite_values(devices: list[Device], make_re
     values = [found.per_view[f"{i}.png"]["PSNR"] for i in range(3)]
     assert values[0] == 100.0
     assert found.psnr == pytest.approx(np.mean(values)) != pytest.approx(np.median(values))
+
+
+def test_nothing_differs_where_nothing_counts() -> None:
+    a, b, hidden = np.zeros((12, 13, 3)), np.ones((12, 13, 3)), np.zeros((12, 13), bool)
+    assert psnr(a, b, mask=hidden) == math.inf
+    assert ssim(a, b, mask=hidden) == 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -458,3 +459,10 @@ def test_wrong_calls_are_errors(make_renderer: MakeRenderer, device: Device) -> 
         renderer.backward(np.zeros((41, 27, 3)))
     with pytest.raises(InputError, match=r"v_alpha: shape \(27, 41, 1\)"):
         renderer.backward(np.zeros((27, 41, 3)), np.zeros((27, 41, 1)))
+
+
+@pytest.mark.parametrize("background", [("a", "b", "c"), (0, 0), (0, 0, np.nan), None, ((1,), (2, 3), 4)])
+def test_a_background_that_is_no_colour_is_refused(background: Any) -> None:
+    splats = Splats.from_points(np.eye(3), np.zeros((3, 3)))
+    with pytest.raises(InputError, match="expected three finite numbers R, G, B"):
+        Renderer().render(splats, Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4)), background=background)

@@ -15,6 +15,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.demo.scene import write_capture
 from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.training import outliers as outliers_module
 from clsplat.training.config import TrainConfig
 from clsplat.training.log import Progress
 from clsplat.training.outliers import FEWEST_VIEWS, Likeness, likeness, outliers
@@ -105,6 +106,22 @@ def test_a_run_goes_on_without_photos_of_wrong_poses(misplaced: Scene) -> None:
     assert trainer.evaluate(test).psnr > kept.evaluate(test).psnr + 0.2, (
         "0.3 to 0.5 dB, by the rounding of the schedule"
     )
+
+
+def test_photos_that_a_later_check_takes_back_are_reported(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = iter([frozenset({1}), frozenset({1})])
+    monkeypatch.setattr(outliers_module, "outliers", lambda measured: next(found, frozenset()))
+    said: list[str] = []
+    config = TrainConfig(iterations=1000, cap_max=200, sh_degree=0)
+    model = train(scene, config, lambda progress: said.append(progress.message), output=tmp_path / "m")
+    assert model.left_out == ()
+    lines = [json.loads(line) for line in (tmp_path / "m" / "log.jsonl").read_text().splitlines()]
+    logged = [(line["iteration"], len(line["left_out"])) for line in lines if "left_out" in line]
+    assert logged == [(100, 1), (200, 1), (300, 0)]
+    assert sum("photos disagree" in message for message in said) == 1
+    assert sum("goes on with all of them" in message for message in said) == 1
 
 
 def test_a_usual_capture_is_not_changed(scene: Scene) -> None:

@@ -63,7 +63,7 @@ def test_growth_reaches_the_cap_after_half_of_the_window(n_first: int, cap: int)
 def test_a_strategy_acts_at_both_ends_of_its_window() -> None:
     config = TrainConfig(strategy="mcmc", iterations=100, densify_from=0.2, densify_until=0.8, densify_interval=20)
     unused: Any = None
-    control = DensityControl(config, unused, RunSchedule.create(config, 1), unused, unused, unused, unused, 1.0)
+    control = DensityControl(config, unused, RunSchedule.create(config, 1), unused, unused, unused, unused, 1.0, 1)
     assert [iteration for iteration in range(101) if control.is_due(iteration)] == [20, 40, 60, 80]
 
 

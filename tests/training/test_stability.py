@@ -68,8 +68,23 @@ def test_training_stops_when_nothing_shows(scene: Scene, devices: list[Device], 
         shape="gaussian", sh_degree=0, iterations=20, densify_interval=5, cap_max=50, init=str(tmp_path / "start.ply")
     )
     trainer = Trainer(scene, config, device=devices[0])
-    with pytest.raises(TrainingError, match=r"iteration 5: no image shows any splat .*check the start \(init\)"):
+    assert 5 < len(scene.train) <= 10, "the run stops once all photos were there"
+    with pytest.raises(TrainingError, match=r"iteration 10: no image shows any splat .*check the start \(init\)"):
         trainer.run()
+
+
+@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+def test_a_photo_that_shows_nothing_does_not_stop_a_run(scene: Scene, devices: list[Device], strategy: str) -> None:
+    """Each iteration densifies, so that one photo decides what was visible."""
+    pose = np.eye(4)
+    pose[2, 3] = -1000.0  # the scene is behind the camera
+    first = scene.train[0]
+    views = [replace(view, camera=view.camera.posed(pose)) if view is first else view for view in scene.views]
+    config = TrainConfig(
+        shape="gaussian", sh_degree=0, iterations=40, densify_interval=1, cap_max=50, strategy=strategy, random_points=0
+    )
+    trainer = Trainer(replace(scene, views=views), config, device=devices[0])
+    assert trainer.run().finished
 
 
 def test_training_refuses_rates_that_it_does_not_survive(scene: Scene, devices: list[Device]) -> None:

@@ -15,10 +15,12 @@ from clsplat.errors import InputError
 from clsplat.evaluation.evaluate import Evaluation, evaluate
 from clsplat.models.model import load_model
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.demo.scene import write_capture
+from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.scenes.split import hold_out, with_validation
 from clsplat.training import validation as validation_module
 from clsplat.training.config import TrainConfig
+from clsplat.training.decisions import decide
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
 from clsplat.training.run import train
@@ -131,6 +133,29 @@ def test_a_resumed_run_keeps_the_best(scene: Scene, tmp_path: Path, falling: dic
     assert model.best_iteration == 14
     assert list(logged(tmp_path / "m")) == MEASURED
     assert ModelFolder(tmp_path / "m").iterations() == [14, 41]
+
+
+def test_interruptions_leave_no_point_clouds_behind(scene: Scene, tmp_path: Path, falling: dict[int, float]) -> None:
+    """The run stops after each of its first best iterations. Only the last best one stays."""
+    for stop_at in (7, 11, 19):
+
+        def stop(trainer: Trainer, event: threading.Event, stop_at: int = stop_at) -> None:
+            if trainer.iteration == stop_at:
+                event.set()
+
+        train(scene, CONFIG, output=tmp_path / "m", visit=stop, resume=stop_at > 7)
+        assert ModelFolder(tmp_path / "m").iterations()[0] == min(stop_at // 2 * 2, 14)
+    train(scene, CONFIG, output=tmp_path / "m", resume=True)
+    assert ModelFolder(tmp_path / "m").iterations() == [14, 41]
+
+
+def test_decisions_are_made_on_what_the_run_learns_from(tmp_path: Path) -> None:
+    """The training photos without the validation views are few enough for the options of few photos."""
+    few = load_scene(write_capture(tmp_path / "yard", 48, 36, 16))
+    assert len(few.train) == 14
+    decided = [decide(few, TrainConfig(validate=validate)).config for validate in (False, True)]
+    assert [bool(config.views.depth_smoothness) for config in decided] == [False, True]
+    assert decided[1] == decide(with_validation(few), TrainConfig(validate=True)).config
 
 
 def test_a_longer_run_does_not_remove_the_shorter_one(scene: Scene, tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ class DensityControl:
     statistics : gradient statistics of the splats since the last densification.
     rng : generator of the run.
     extent : extent of the scene [world units].
+    photos : number of training photos.
     frozen : the splats that do not change (training/context.py); None without any.
     """
 
@@ -43,12 +44,14 @@ class DensityControl:
         statistics: SplatStatistics,
         rng: np.random.Generator,
         extent: float,
+        photos: int,
         frozen: FrozenSplats | None = None,
     ) -> None:
         self.frozen = frozen
         self.config, self.schedule, self.splats, self.optimizer = config, schedule, splats, optimizer
         self.statistics, self.rng, self.extent = statistics, rng, extent
-        self.kernels = kernels
+        self.kernels, self.photos = kernels, photos
+        self._empty = 0  # photos in a row that showed no splat, up to the last densification
 
     def is_due(self, iteration: int) -> bool:
         """Whether the strategy densifies after this iteration."""
@@ -56,20 +59,24 @@ class DensityControl:
         return first <= iteration <= last and iteration % self.config.densify_every == 0
 
     def densify(self, iteration: int) -> None:
-        """Add, move and remove splats, and set the statistics to zero.
+        """Add, move and remove splats, and set the statistics to zero. Without a visible splat, nothing is done.
 
         Raises
         ------
-        TrainingError : no splat was visible since the last densification, or no splat is finite.
+        TrainingError : no photo of all of them showed a splat, or no splat is finite.
         """
         info = StepInfo(iteration, self.schedule.densify_last, self.schedule.growth, self.extent)
         self.optimizer.settle()
         statistics = self.statistics.read(self.splats.n)
         if self.splats.n and not statistics[SplatStatistics.TIMES_SEEN].any():
+            self._empty += self.config.densify_every * self.config.schedule.batch
+            if self._empty < self.photos:
+                return
             raise TrainingError(
                 f"iteration {iteration}: no image shows any splat (transparent, or outside of all images): "
                 "check the start (init) and the learning rates"
             )
+        self._empty = 0
         table: SplatTable = DeviceSplats(self.splats, columns_program(self.splats.device, self.kernels))
         if self.frozen is not None:
             table, statistics = LiveSplats(table, self.frozen.n_live), statistics[:, : self.frozen.n_live]

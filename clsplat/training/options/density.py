@@ -28,7 +28,8 @@ class DensityConfig(OptionGroup):
     )
     init_opacity: float = option(0.2, help="Opacity of splats that are created from points.", above=0, below=1)
     init_scale: float = option(
-        help="Scale of splats that are created from points, as a factor of the mean distance to three neighbours.",
+        help="Scale of splats that are created from points, as a factor of the distance to three neighbours (root mean "
+        "square).",
         above=0,
     )
     opacity_reg: float = option(help="Weight of the mean opacity in the loss.", at_least=0, by_scene=True)

@@ -28,7 +28,7 @@ class StartConfig(OptionGroup):
     random_points: float | None = option(
         None,
         help="Number of random points that are added to the scene's points, as a fraction of the cap. With init "
-        "random, 0 stands for the whole cap.",
+        "random, 0 stands for the whole cap, but at most 100 000 points.",
         at_least=0,
         at_most=1,
         by_scene=True,
