@@ -18,7 +18,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 def with_opacity(scene: Scene, lowest: int) -> Scene:
-    """Return the scene with photos of which one pixel has this opacity."""
+    """Return the scene with one pixel of this opacity in each photo."""
 
     def changed(view: View) -> View:
         alpha = np.full(view.image.shape[:2], 255, np.uint8)
