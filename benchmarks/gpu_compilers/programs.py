@@ -18,9 +18,11 @@ from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
 from clsplat.splats.low_pass import PIXEL
 from clsplat.training.programs import (
+    EXPOSURE_GROUP,
     columns_program,
     depth_program,
     dropout_program,
+    exposure_program,
     lazy_program,
     loss_program,
     optim_program,
@@ -59,6 +61,8 @@ def programs() -> dict[str, str]:
             texts[f"bin {shape}"] = built.pop()
         loss_program(device, KernelBuild(SHAPES[0], _SH_DEGREE, gpu))
         texts["loss"] = built.pop()
+        exposure_program(device, KernelBuild(SHAPES[0], _SH_DEGREE, gpu))
+        texts["exposure"] = built.pop()
         dropout_program(device)
         texts["dropout"] = built.pop()
         sort_program(device, SCAN_GROUP)
@@ -70,6 +74,8 @@ def group_size(program: str, kernel: str) -> int:
     """Return the number of work-items of a kernel's groups."""
     if kernel in _PIXEL_KERNELS:
         return SCHEDULES[program.split()[-1]].group
+    if kernel == "step_exposure":
+        return EXPOSURE_GROUP
     return SCAN_GROUP if kernel in _SCAN_KERNELS else ITEM_GROUP
 
 
