@@ -31,7 +31,7 @@ _KEY = "exposure"  # key of the optimizer state in a checkpoint
 _IDENTITY = np.eye(3, 4)
 
 
-class ExposureLoss:
+class PhotoLoss:
     """The loss of renders against training photos, and the exposures of the photos.
 
     Parameters
@@ -136,7 +136,7 @@ class ExposureLoss:
         sums: NDArray[np.floating] = np.empty(EXPOSURE_SUMS * self._parts, self.kernels.dtype)
         return to_host(self.device, self._partial.buffer, sums)
 
-    def follow(self, other: ExposureLoss) -> None:
+    def follow(self, other: PhotoLoss) -> None:
         """Take the exposures of all photos from another device."""
         if self.learns:
             to_device(self.device, self._exposures, other._download())
@@ -180,5 +180,5 @@ def needs_exposure(config: TrainConfig, channels: int) -> bool:
 
 
 def exposure_bytes(layout: ImageLayout, itemsize: int, config: TrainConfig, channels: int) -> int:
-    """Return the device memory of `ExposureLoss` for images of the layout."""
+    """Return the device memory of `PhotoLoss` for images of the layout."""
     return (3 * itemsize + 3) * layout.plane if needs_exposure(config, channels) else 0

@@ -16,7 +16,7 @@ from ..splats.fields import Array
 from .config import TrainConfig
 from .depth_smoothness import DepthSmoothness
 from .dropout import SplatDropout
-from .exposure import ExposureLoss
+from .exposure import PhotoLoss
 from .loss import ImageLoss, LossResult
 from .loss_check import check_loss
 from .memory_estimate import Estimate, room_for_isects, run_memory
@@ -63,7 +63,7 @@ class Replica:
         check_step(device, kernels, config.sghmc.position_optimizer)
         channels = target_channels(scene.train, config)
         self.targets = Targets(device, kernels, scene.train, target_budget(device), channels)
-        self.exposure = ExposureLoss(self.loss, self.targets, config, config.background)
+        self.exposure = PhotoLoss(self.loss, self.targets, config, config.background)
         self.dropout = SplatDropout(config, self.splats)
         self.smoothness = DepthSmoothness(config, kernels, self.splats, scene.train, max_isects)
 

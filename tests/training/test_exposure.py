@@ -27,7 +27,7 @@ from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import decide
-from clsplat.training.exposure import ExposureLoss
+from clsplat.training.exposure import PhotoLoss
 from clsplat.training.exposure_file import exposures_json, read_exposures
 from clsplat.training.folder import ModelFolder
 from clsplat.training.loss import ImageLoss
@@ -72,13 +72,13 @@ def views_of(masks: bool, alphas: bool) -> list[View]:
     return views
 
 
-def exposure_loss(device: Device, schedule: Schedule, real: Real, views: list[View], exposure: bool) -> ExposureLoss:
+def photo_loss(device: Device, schedule: Schedule, real: Real, views: list[View], exposure: bool) -> PhotoLoss:
     if real == "double" and not device.has_fp64:
         pytest.skip("no double precision")
     kernels = KernelBuild("gaussian", 0, schedule, real=real)
     config = TrainConfig(exposure=exposure, random_background=True, iterations=100)
     targets = Targets(device, kernels, views, 10**9, target_channels(views, config))
-    return ExposureLoss(ImageLoss(Pool(device), kernels, 0.2), targets, config, BEHIND)
+    return PhotoLoss(ImageLoss(Pool(device), kernels, 0.2), targets, config, BEHIND)
 
 
 def wanted_of(
@@ -146,7 +146,7 @@ def test_gradients_and_step_equal_the_reference(
     """One target has no mask and one no opacity, among others that have them."""
     views = views_of(masks, alphas)
     device, schedule = scheduled
-    exposure = exposure_loss(device, schedule, real, views, exposure=True)
+    exposure = photo_loss(device, schedule, real, views, exposure=True)
     dtype = exposure.kernels.dtype
     exposures = some_exposures(len(views))
     exposure.load_state({"exposure": exposures.reshape(-1, 12)})
@@ -188,7 +188,7 @@ def test_exposures_and_random_backgrounds_need_the_opacity_of_photos() -> None:
 
 
 def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
-    exposure = exposure_loss(device, default_schedule(device.info), "float", views_of(False, False), exposure=False)
+    exposure = photo_loss(device, default_schedule(device.info), "float", views_of(False, False), exposure=False)
     assert not exposure.in_use
     assert exposure.targets.channels == 3
     np.testing.assert_array_equal(exposure.exposures(), np.tile(np.eye(3, 4), (4, 1, 1)))
