@@ -15,9 +15,10 @@ from ..errors import InputError
 from ..rendering.renderer import Rendered, Renderer
 from ..splats.approximate import nearest_gaussians
 from ..splats.color import BLACK
+from ..splats.convert import convert
 from ..splats.fields import Array, DoubleArray
 from ..splats.merging import boxes_of, leaves_of, levels_of
-from ..splats.shapes import GAUSSIAN
+from ..splats.shapes import GAUSSIAN, shape_named
 from ..splats.splats import Splats
 
 LEVELS, MAX_LEVELS = 8, 12  # by default, and at most
@@ -28,7 +29,7 @@ Choice = NDArray[np.int64]
 
 
 class DetailLevels:
-    """The levels of a model.
+    """The levels of a model. Splats of negative opacity are only merged with each other.
 
     Parameters
     ----------
@@ -49,20 +50,25 @@ class DetailLevels:
         if levels not in range(1, MAX_LEVELS + 1):
             raise InputError(f"{levels} levels of detail: choose 1 to {MAX_LEVELS}")
         self.splats = splats
-        gaussians = splats if splats.shape == GAUSSIAN.name else nearest_gaussians(splats)
-        leaves = leaves_of(gaussians.mean, _LEAF)
-        found = levels_of(gaussians.arrays, leaves, levels)
-        self._low, self._high = (np.stack(corners) for corners in zip(*boxes_of(found, len(leaves)), strict=True))
+        signs = 2 if shape_named(splats.shape).signed else 1
+        leaves = leaves_of(splats.mean, _LEAF)
+        n = len(leaves)
+        # Splats of negative opacity have groups of their own, so that they are only merged with each other.
+        negative = splats.opacity_logit < 0.0 if signs == 2 else np.zeros(len(splats), np.bool_)
+        groups = [rows[negative[rows] == bool(sign)] for rows in leaves for sign in range(signs)]
+        found = levels_of(self._gaussians(negative).arrays, groups, levels)
+        low, high = (np.reshape(corner, (n, signs, 3)) for corner in zip(*boxes_of(found, n * signs), strict=True))
+        self._low, self._high = low.min(axis=1), high.max(axis=1)
         parts, distances = [], []
         for number, level in enumerate(found):
-            rows = np.argsort(level.group, kind="stable")
-            part = splats if number == 0 else self._as_model(level.arrays())
+            leaf, rows = level.group // signs, np.argsort(level.group, kind="stable")
+            part = splats if number == 0 else self._as_model(level.arrays(), level.group % signs == 1)
             parts.append({name: array[rows] for name, array in part.arrays.items()})
             mass = np.maximum(level.opacity, 1e-9)
-            total = np.bincount(level.group, mass, len(leaves))
-            spread = np.bincount(level.group, mass * level.spread, len(leaves))
+            total = np.bincount(leaf, mass, n)
+            spread = np.bincount(leaf, mass * level.spread, n)
             distances.append(np.sqrt(spread / np.maximum(total, 1e-300)))
-        self.counts = np.stack([np.bincount(level.group, minlength=len(leaves)) for level in found])
+        self.counts = np.stack([np.bincount(level.group // signs, minlength=n) for level in found])
         self.distances = np.maximum.accumulate(np.stack(distances), axis=0)
         self._first = np.cumsum(np.r_[0, self.counts.ravel()])[:-1].reshape(self.counts.shape)
         self._all = splats.with_arrays({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
@@ -71,11 +77,30 @@ class DetailLevels:
     def __len__(self) -> int:
         return len(self.counts)
 
-    def _as_model(self, arrays: dict[str, Array]) -> Splats:
-        """Return Gaussians with the kernel of the model, whose further fields are neutral."""
+    def _gaussians(self, negative: NDArray[np.bool_]) -> Splats:
+        """Return the Gaussian nearest to each splat. Splats of negative opacity count with its absolute value."""
+        splats = self.splats
+        if splats.shape == GAUSSIAN.name:
+            return splats
+        raw = splats.opacity_logit
+        return nearest_gaussians(
+            splats.with_arrays(splats.to_numpy() | {"opacity_logit": np.where(negative, -raw, raw)})
+        )
+
+    def _as_model(self, arrays: dict[str, Array], negative: NDArray[np.bool_]) -> Splats:
+        """Return Gaussians with the kernel of the model, whose further fields are neutral.
+
+        negative : (N,) Gaussians of negative opacity.
+        """
         model = self.splats
         gaussians = model.like(GAUSSIAN.name, arrays, model.normalisation)
-        return gaussians if model.shape == GAUSSIAN.name else gaussians.as_shape(model.shape)
+        if model.shape == GAUSSIAN.name:
+            return gaussians
+        whole = convert(gaussians, model.shape)
+        if not negative.any():
+            return whole
+        raw = whole.opacity_logit
+        return whole.with_arrays(whole.to_numpy() | {"opacity_logit": np.where(negative, -raw, raw)})
 
     def choose(self, camera: Camera, pixels: float) -> Choice:
         """Return the level of each leaf, (leaves,), and -1 for leaves outside the image.

@@ -59,6 +59,33 @@ def test_the_first_level_is_the_model() -> None:
     assert (levels.distances[0] == 0).all()
 
 
+def test_negative_splats_stay_where_they_are_and_merge_with_each_other() -> None:
+    """A wall of Student's t, and small negative splats before it, as SSS has them."""
+    front = wall(24, "student-t")
+    back = wall(24, "student-t")
+    arrays = back.to_numpy()
+    arrays["mean"][:, 1] -= 0.02
+    arrays["opacity_logit"][:] = -0.1
+    arrays["sh"][:] *= 0.5
+    parts = {name: np.concatenate([front.arrays[name], array]) for name, array in arrays.items()}
+    order = np.random.default_rng(0).permutation(len(parts["mean"]))
+    splats = front.with_arrays({name: array[order] for name, array in parts.items()})
+    levels = DetailLevels(splats, levels=3)
+    assert levels.counts[0].sum() == len(splats)
+    signs = [np.sort(np.sign(levels.whole(level).opacity_logit)) for level in range(3)]
+    for sign in signs:
+        assert 0.4 < np.mean(sign < 0) < 0.6
+    # A mix of the first and the second level: the leaves of the first have their own splats.
+    choice = np.arange(levels.counts.shape[1]) % 2
+    rows = {row.tobytes() for row in splats.mean}
+    own = sum(row.tobytes() in rows for row in levels.at(choice).mean)
+    assert own == levels.counts[0, choice == 0].sum()
+    renderer, camera = Renderer(), before_wall(4.0)
+    images = [renderer.render(one, camera).color for one in (splats, levels.at(choice), levels.whole(1))]
+    assert psnr(images[0], images[1], rounded=False) > 29
+    assert psnr(images[0], images[2], rounded=False) > 26
+
+
 def test_each_level_has_about_half_of_the_splats_and_wider_merges() -> None:
     levels = DetailLevels(wall(), levels=4)
     totals = levels.counts.sum(axis=1)
