@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .image_names import IMAGE_SUFFIXES
 from .images import read_image
 
 Mask = NDArray[np.bool_]
@@ -23,7 +25,7 @@ def mask_files(folder: Path, photos: Mapping[str, Path]) -> dict[str, Path]:
     """Return the mask files in a folder by the names of their photos.
 
     The mask of `sub/a.jpg` is the first existing file of `sub/a.jpg.png` (COLMAP's form), `sub/a.png`,
-    `sub/a.mask.png` and `sub/a.jpg`. A photo is never its own mask.
+    `sub/a.mask.png` and `sub/a.jpg`, or of the same with `.PNG`. A photo is never its own mask.
 
     Parameters
     ----------
@@ -31,6 +33,37 @@ def mask_files(folder: Path, photos: Mapping[str, Path]) -> dict[str, Path]:
     """
     found = {name: _mask_of(folder, name, file) for name, file in photos.items()}
     return {name: mask for name, mask in found.items() if mask is not None}
+
+
+def warn_of_unused(folder: Path, photos: Mapping[str, Path], masks: Mapping[str, Path]) -> None:
+    """Warn if images in a folder of masks have names that are not quite those of masks.
+
+    Masks of other photos are no reason: a scene may have fewer photos than there are masks.
+
+    Parameters
+    ----------
+    photos : file of each photo by name. masks : those that `mask_files` found there.
+    """
+    files = (Path(place) / name for place, _, names in os.walk(folder) for name in names)
+    used = {str(mask) for mask in masks.values()}
+    found = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES and str(file) not in used]
+    without = {str(PurePosixPath(name).with_suffix("")): name for name in photos if name not in masks}
+    misnamed = {}
+    for file in found:
+        stem = file.relative_to(folder)
+        while stem.suffix and stem.as_posix() not in without:
+            stem = stem.with_suffix("")
+        if stem.as_posix() in without:
+            misnamed[file.name] = without[stem.as_posix()]
+    if not masks and found and photos:
+        misnamed = misnamed or {min(found).name: min(photos)}
+    if misnamed:
+        file_name, photo = min(misnamed.items())
+        warnings.warn(
+            f"{folder}: {len(misnamed) if masks else len(found)} images in it are masks of no photo, for example "
+            f"{file_name!r}; a mask of {photo!r} is {photo}.png: rename them",
+            stacklevel=4,
+        )
 
 
 def masks_beside(photos: Mapping[str, Path]) -> dict[str, Path]:
@@ -51,7 +84,8 @@ def masks_beside(photos: Mapping[str, Path]) -> dict[str, Path]:
 
 def _mask_of(folder: Path, name: str, file: Path) -> Path | None:
     photo = PurePosixPath(name)
-    candidates = (f"{name}.png", str(photo.with_suffix(".png")), str(photo.with_suffix(BESIDE)), name)
+    candidates = [f"{name}.png", str(photo.with_suffix(".png")), str(photo.with_suffix(BESIDE)), name]
+    candidates += [f"{name}.PNG", str(photo.with_suffix(".PNG"))]
     masks = (folder / candidate for candidate in candidates)
     return next((mask for mask in masks if os.path.isfile(mask) and not is_same_file(mask, file)), None)
 

@@ -16,7 +16,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError, check_choice
 from ..files.digest import file_digest
 from ..files.images import ImageU8
-from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files, masks_beside
+from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files, masks_beside, warn_of_unused
 from ..files.real_path import real_path
 from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
@@ -321,6 +321,8 @@ def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, 
     masks = mask_files(path, files)
     if folder is not None and posed.names and not masks:
         raise InputError(f"{path}: no mask of any photo in it; a mask of {posed.names[0]!r} is {posed.names[0]}.png")
+    if not posed.masks:
+        warn_of_unused(path, files, masks)
     named = {name: find() for name, find in posed.masks.items() if name not in masks}
     return (masks_beside(files) if folder is None else {}) | named | masks
 

@@ -35,6 +35,16 @@ def with_validation(scene: Scene) -> Scene:
     return replace(scene, validation_names=_every_few(scene, Remedy("train without validation views")))
 
 
+def split_for_run(scene: Scene, validate: bool) -> Scene:
+    """Return the scene of a run. With `validate` it has validation views; those that it has already stay.
+
+    Raises
+    ------
+    InputError : the scene has fewer than three training views.
+    """
+    return with_validation(scene) if validate and not scene.validation_names else scene
+
+
 def _every_few(scene: Scene, without: Remedy) -> frozenset[str]:
     """Return the names of the training views that are held out. without : what to do if they are too few."""
     views = scene.train

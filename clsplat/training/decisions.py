@@ -47,7 +47,6 @@ from .near_plane import choose_near_plane
 from .options.density import Adc, Mcmc
 from .options.groups import OptimConfig
 from .options.option import option_table
-from .photos import of_run
 from .plain_background import plain_background
 from .silhouettes import TRANSPARENT_SHARE, transparent_share
 
@@ -110,7 +109,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     scene : its training views and points are looked at, never its test views.
     config : options of the run. All options of a stored run count as named (`TrainConfig.named_options`).
     """
-    scene = of_run(scene, config)
+    from ..scenes.split import split_for_run  # lazy: it loads an image library, which would slow down --help
+
+    scene = split_for_run(scene, config.validation.validate)
     chosen, reasons, share = for_background(scene, config)
     transparent = share >= TRANSPARENT_SHARE
     why = random_start(scene, config)

@@ -1,4 +1,4 @@
-"""The photos that a run learns from, and those that it holds out."""
+"""The photos that a run learns from."""
 
 from __future__ import annotations
 
@@ -8,21 +8,10 @@ from ..errors import InputError
 from ..scenes.cut_out import cut_out_when_read
 from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene
-from ..scenes.split import with_validation
 from ..splats.color import Color
 from .config import TrainConfig
 
 _OPAQUE = 255
-
-
-def of_run(scene: Scene, config: TrainConfig) -> Scene:
-    """Return the scene of a run: some training views become validation views if the run has that option.
-
-    Raises
-    ------
-    InputError : the scene has fewer than three training views.
-    """
-    return with_validation(scene) if config.validation.validate and not scene.validation_names else scene
 
 
 def with_photos(scene: Scene, config: TrainConfig) -> Scene:

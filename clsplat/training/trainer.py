@@ -21,6 +21,7 @@ from ..rendering.frame import Frame
 from ..rendering.renderer import Renderer
 from ..rendering.tuning import schedule_for
 from ..scenes.scene import Scene, View
+from ..scenes.split import split_for_run
 from ..splats.fields import Array
 from ..splats.optical_depth import finite_rows
 from ..splats.splats import Splats
@@ -43,7 +44,7 @@ from .model import Model
 from .occluders import OccluderCheck
 from .optim.optimizer import make_optimizer
 from .outliers import OutlierCheck
-from .photos import of_run, with_photos
+from .photos import with_photos
 from .programs import kernel_build
 from .rate_limits import check_rates
 from .replica import Replica
@@ -86,7 +87,7 @@ class Trainer:
     ) -> None:
         check_context(context, config, checkpoint)
         self.context = context
-        scene = of_run(scene, config)
+        scene = split_for_run(scene, config.validation.validate)
         if not scene.train:
             raise InputError(f"{scene.path}: no training views: all are test views")
         check_sizes(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -212,3 +213,29 @@ def test_mask_path_of_a_frame(tmp_path: Path) -> None:
         (tmp_path / "transforms.json").write_text(json.dumps(document | {"frames": [frame | {"mask_path": mask_path}]}))
         with pytest.raises(InputError, match=message):
             load_scene(tmp_path, eval=False)
+
+
+def test_masks_with_names_that_are_not_quite_right_are_reported(folder: Path) -> None:
+    """Masks of other photos, which a scene may lack, are no reason."""
+    masks, (first, second, *others) = folder / "masks", NAMES
+    for name in others:
+        write_mask(masks / f"{name}.png", left_half())
+    for name in (f"{Path(first).stem}.tif.png", f"{Path(second).stem}.jpg.mask.png", "of_another_photo.png"):
+        write_mask(masks / name, left_half())
+    with pytest.warns(UserWarning, match=rf"2 images in it are masks of no photo.*is {first}.png: rename them"):
+        load_scene(folder)
+    (masks / f"{Path(first).stem}.tif.png").rename(masks / f"{Path(first).stem}.PNG")
+    (masks / f"{Path(second).stem}.jpg.mask.png").rename(masks / f"{second}.PNG")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert all(view.loaded().mask is not None for view in load_scene(folder).views)
+
+
+def test_a_folder_of_masks_with_other_names_is_reported(folder: Path) -> None:
+    for number in range(3):
+        write_mask(folder / "masks" / f"mask{number}.png", left_half())
+    with pytest.warns(UserWarning, match=r"3 images in it are masks of no photo, for example 'mask0.png'"):
+        load_scene(folder)
+    (folder / "masks").rename(folder / "images" / "masks")
+    with pytest.warns(UserWarning, match=r"3 images in it are masks of no photo"):
+        find_photos(folder / "images")

@@ -24,7 +24,7 @@ from ...files.images import (
     write_photo,
     write_png,
 )
-from ...files.masks import MASK_FOLDER, Mask, mask_files, masks_beside, read_mask, resize_mask
+from ...files.masks import MASK_FOLDER, Mask, mask_files, masks_beside, read_mask, resize_mask, warn_of_unused
 from ...files.real_path import real_path
 from ..colmap_folder import colmap_folder
 from ..photo_listing import Listing, list_images
@@ -122,7 +122,9 @@ def find_photos(path: Path) -> list[PhotoFile]:
         if not name.isprintable():  # a model's files cannot store line ends and names that are not UTF-8
             raise InputError(f"{home}: the name {name!a} cannot be written into a model; rename the photo")
     folder, files = path / MASK_FOLDER, {name: home / name for name in names}
-    masks = masks_beside(files) | (mask_files(folder, files) if folder.is_dir() else {})
+    in_folder = mask_files(folder, files) if folder.is_dir() else {}
+    warn_of_unused(folder, files, in_folder)
+    masks = masks_beside(files) | in_folder
     return [
         PhotoFile(scene_name, home / name, masks.get(name))
         for name, scene_name in zip(names, _scene_names(names), strict=True)
