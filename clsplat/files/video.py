@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, OutputError
 from .atomic import atomic_path
 
+LONGEST_SIDE = 16384  # of a frame [px], for x264
 SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv")
 _QUALITY = "18"  # x264's constant rate factor: hardly different from the frames by eye
 # Colours follow BT.709, and the file says so. Players would otherwise guess from the size of the image.
@@ -75,6 +76,7 @@ class VideoWriter:
         """
         height, width = frame.shape[:2]
         if self._writer is None:
+            check_frame_size(self.path, width, height)
             self._size = (height, width)
             self._open()
         if (height, width) != self._size:
@@ -128,6 +130,15 @@ class VideoWriter:
     def _failed(self, error: Exception) -> OutputError:
         reason = next((line for line in reversed(str(error).splitlines()) if line.strip()), type(error).__name__)
         return OutputError(f"{self.path}: the encoder failed ({reason.strip()[:200]}); check the disk's free space")
+
+
+def check_frame_size(path: object, width: int, height: int) -> None:
+    """Raise InputError if the encoder cannot write frames of a size [px]."""
+    if max(width, height) > LONGEST_SIDE:
+        raise InputError(
+            f"{path}: frames of {width}x{height} px; a video has at most {LONGEST_SIDE} px a side: choose a smaller "
+            "size, or write images"
+        )
 
 
 def require_encoder() -> None:

@@ -19,7 +19,7 @@ from ..files.real_path import real_path
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
 from ..splats.color import Color
-from ..splats.formats.any_file import check_ending
+from ..splats.formats.any_file import check_ending, check_shape
 from ..splats.formats.page_payload import PAGE_ENDING
 from ..splats.splats import Splats
 from ..training.exposure_file import copy_exposures
@@ -127,11 +127,13 @@ def _check_output(output: Path, model: LoadedModel, overwrite: bool) -> None:
     if output.suffix:
         if output.is_dir():
             raise OutputError(f"{output}: is a folder: name a file, or a folder without a dot in its name")
-        check_ending(output, PAGE_ENDING)
+        check_shape(output, check_ending(output, PAGE_ENDING), model.splats.shape)
         refuse_existing([output], overwrite)
         return
     if model.folder is None or not model.folder.config_path.is_file():
-        raise OutputError(f"{output}: {model.path} has no config.json to copy: name a .ply, .splat or .spz file")
+        raise OutputError(
+            f"{output}: {model.path} has no config.json to copy: name a file instead, such as {output}.ply"
+        )
     if real_path(output) == real_path(model.folder.path):
         raise OutputError(f"{output}: is the model itself: name another folder")
     if output.exists() and not output.is_dir():

@@ -16,7 +16,7 @@ from ..errors import SMALLER_IMAGES, InputError, OutputError, check_choice
 from ..files.existing import refuse_existing
 from ..files.host_memory import available_bytes
 from ..files.real_path import real_path
-from ..files.video import VideoWriter
+from ..files.video import VideoWriter, check_frame_size
 from ..rendering.renderer import Renderer
 from ..rendering.views import RenderOutput, ViewProgress, files_of, render_to_files
 from ..scenes.options import VIEW_SETS
@@ -109,6 +109,9 @@ def render_views(
     loaded = model_at(model, iteration)
     views, path = choose_views(loaded, choice)
     _check_memory(views)
+    if output.video is not None:
+        for view in views:
+            check_frame_size(output.video, view.camera.width, view.camera.height)
     fps = output.fps or (path.fps if path is not None else DEFAULT_FPS)
     path_cameras = None if path is None or output.folder is None else Path(output.folder) / "cameras.json"
     kept = None if loaded.folder is None else loaded.folder.cameras_path

@@ -36,3 +36,7 @@ def test_clean_refuses(model: Path, scene: Path, tmp_path: Path) -> None:
     assert "no such model folder" in error_of("clean", tmp_path / "none", "-o", out)
     assert "is the model itself" in error_of("clean", model, "-o", model, "--overwrite")
     assert not out.exists()
+    for ending in (".spz", ".splat"):
+        said = error_of("clean", model, "-o", tmp_path / f"out{ending}")
+        assert f"{ending} files hold gaussian splats, not skew-normal: choose .ply, or convert it" in said
+        assert "measuring" not in said

@@ -250,6 +250,14 @@ def test_render_videos_of_colour_depth_and_alpha(model: Path, tmp_path: Path) ->
     assert (tmp_path / "only.mp4").stat().st_size > 500
 
 
+def test_frames_that_the_encoder_cannot_write_are_refused_before_the_work(model: Path, tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
+    for size in ("16386x10", "10x16386"):
+        said = error_of("render", model, "--path", "orbit", "--size", size, "--video", tmp_path / "v.mp4")
+        assert f"frames of {size} px; a video has at most 16384 px a side" in said
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_interrupted_video_says_so_and_leaves_nothing(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

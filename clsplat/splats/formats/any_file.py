@@ -183,6 +183,15 @@ def check_ending(path: Path, *without: str) -> str:
     return suffix
 
 
+def check_shape(path: Path, form: str, shape: str) -> None:
+    """Raise OutputError if a format of WRITTEN does not hold splats of a shape, before any work is done for the file."""
+    shapes = WRITTEN[form].shapes
+    if shapes is not None and shape not in shapes:
+        raise OutputError(
+            f"{path}: {form} files hold {', '.join(shapes)} splats, not {shape}: choose .ply, or convert it"
+        )
+
+
 def _start(path: Path) -> bytes:
     """Return the first bytes of a file; none if it cannot be read, which its reader reports."""
     try:
