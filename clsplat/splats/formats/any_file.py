@@ -184,7 +184,7 @@ def check_ending(path: Path, *without: str) -> str:
 
 
 def check_shape(path: Path, form: str, shape: str) -> None:
-    """Raise OutputError if a format of WRITTEN does not hold splats of a shape, before any work is done for the file."""
+    """Raise OutputError if files of a format of WRITTEN do not hold splats of a shape."""
     shapes = WRITTEN[form].shapes
     if shapes is not None and shape not in shapes:
         raise OutputError(
