@@ -76,7 +76,7 @@ def nearest_gaussians(splats: Splats) -> Splats:
     source = shape_named(splats.shape)
     if source.normalised and splats.normalisation != _PEAK:
         raise InputError(
-            f"convert: normalisation {splats.normalisation!r}: the height of such a splat changes with "
+            f"normalisation {splats.normalisation!r}: the height of such a splat changes with "
             f"the view, and that of a Gaussian does not; train with {_PEAK!r}"
         )
     if source.signed:

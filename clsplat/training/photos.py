@@ -35,12 +35,12 @@ def _check_background(scene: Scene, background: Color) -> None:
         if view.alpha is not None and view.alpha.min() < _OPAQUE:
             raise InputError(
                 f"{scene.path}: its transparent photos, such as {view.name!r}, lie over the background "
-                f"{_triple(scene.background)}, but the run has {_triple(background)}: read the scene with "
+                f"{_numbers(scene.background)}, but the run has {_numbers(background)}: read the scene with "
                 "background=config.background"
             )
 
 
-def _triple(color: Color) -> str:
+def _numbers(color: Color) -> str:
     return ",".join(f"{part:.3g}" for part in color)
 
 
