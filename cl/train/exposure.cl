@@ -61,7 +61,7 @@ kernel void photo_of_render(
     global const real *row = exposures + EXPOSURE * view;
     const real back[3] = {back_r, back_g, back_b}, shift[3] = {shift_r, shift_g, shift_b};
     const vreal zero = (vreal)0;
-    real behind[3];  // what the exposure took from the background
+    real behind[3];  // what the exposure would change of the background, with the other sign
     for (int c = 0; c < 3; ++c) {
         global const real *e = row + 4 * c;
         behind[c] = back[c] - (e[0] * back_r + e[1] * back_g + e[2] * back_b + e[3]);

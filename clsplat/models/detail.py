@@ -56,7 +56,7 @@ class DetailLevels:
         # Splats of negative opacity have groups of their own, so that they are only merged with each other.
         negative = splats.opacity_logit < 0.0 if signs == 2 else np.zeros(len(splats), np.bool_)
         groups = [rows[negative[rows] == bool(sign)] for rows in leaves for sign in range(signs)]
-        found = levels_of(self._gaussians(negative).arrays, groups, levels)
+        found = levels_of(nearest_gaussians(_negated(splats, negative)).arrays, groups, levels)
         low, high = (np.reshape(corner, (n, signs, 3)) for corner in zip(*boxes_of(found, n * signs), strict=True))
         self._low, self._high = low.min(axis=1), high.max(axis=1)
         parts, distances = [], []
@@ -77,30 +77,13 @@ class DetailLevels:
     def __len__(self) -> int:
         return len(self.counts)
 
-    def _gaussians(self, negative: NDArray[np.bool_]) -> Splats:
-        """Return the Gaussian nearest to each splat. Splats of negative opacity count with its absolute value."""
-        splats = self.splats
-        if splats.shape == GAUSSIAN.name:
-            return splats
-        raw = splats.opacity_logit
-        return nearest_gaussians(
-            splats.with_arrays(splats.to_numpy() | {"opacity_logit": np.where(negative, -raw, raw)})
-        )
-
     def _as_model(self, arrays: dict[str, Array], negative: NDArray[np.bool_]) -> Splats:
         """Return Gaussians with the kernel of the model, whose further fields are neutral.
 
         negative : (N,) Gaussians of negative opacity.
         """
-        model = self.splats
-        gaussians = model.like(GAUSSIAN.name, arrays, model.normalisation)
-        if model.shape == GAUSSIAN.name:
-            return gaussians
-        whole = convert(gaussians, model.shape)
-        if not negative.any():
-            return whole
-        raw = whole.opacity_logit
-        return whole.with_arrays(whole.to_numpy() | {"opacity_logit": np.where(negative, -raw, raw)})
+        gaussians = self.splats.like(GAUSSIAN.name, arrays, self.splats.normalisation)
+        return _negated(convert(gaussians, self.splats.shape), negative)
 
     def choose(self, camera: Camera, pixels: float) -> Choice:
         """Return the level of each leaf, (leaves,), and -1 for leaves outside the image.
@@ -160,6 +143,14 @@ class DetailLevels:
     def seen(self, camera: Camera, pixels: float) -> Splats:
         """Return the splats to draw for a camera; `pixels` as for `choose`."""
         return self.at(self.choose(camera, pixels))
+
+
+def _negated(splats: Splats, rows: NDArray[np.bool_]) -> Splats:
+    """Return the splats with the negative opacity in some rows (N,)."""
+    if not rows.any():
+        return splats
+    raw = splats.opacity_logit
+    return splats.with_arrays(splats.to_numpy() | {"opacity_logit": np.where(rows, -raw, raw)})
 
 
 class DetailRenderer:

@@ -128,9 +128,9 @@ def check_init(init: str) -> None:
     """Raise InputError if the option `init` is unknown, or names a file that does not exist. The file is not read."""
     if names_model(init) and not Path(init).exists():
         raise InputError(f"{init}: cannot be read (no such file); check its name")
-    if Path(init).is_dir() and ModelFolder(init).is_used:
-        raise InputError(f"init {init!r}: is a model folder: name its file {ModelFolder(init).latest_ply()[0]}")
     if not names_model(init) and init not in FROM_POINTS:
+        if ModelFolder(init).is_used:
+            raise InputError(f"init {init!r}: is a model folder: name its file {ModelFolder(init).latest_ply()[0]}")
         raise InputError(f"init {init!r}: choose sfm, random, or the path of a file of splats")
 
 

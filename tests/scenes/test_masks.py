@@ -15,7 +15,7 @@ from small_scene import HEIGHT, N_VIEWS, NAMES, WIDTH, photo_of, write_garden
 from clsplat.errors import InputError
 from clsplat.files.images import read_image, write_png
 from clsplat.files.masks import mask_files, read_mask, resize_mask
-from clsplat.scenes.reconstruct.photo_files import find_photos
+from clsplat.scenes.reconstruct.photo_files import find_photos, fingerprint
 from clsplat.scenes.scene import load_scene
 from clsplat.training.config import TrainConfig
 from clsplat.training.trainer import Trainer
@@ -239,3 +239,14 @@ def test_a_folder_of_masks_with_other_names_is_reported(folder: Path) -> None:
     (folder / "masks").rename(folder / "images" / "masks")
     with pytest.warns(UserWarning, match=r"3 images in it are masks of no photo"):
         find_photos(folder / "images")
+
+
+def test_the_fingerprint_of_photos_does_not_warn_again(folder: Path) -> None:
+    write_mask(folder / "images" / "masks" / "other.png", left_half())
+    with pytest.warns(UserWarning, match="masks of no photo"):
+        find_photos(folder / "images")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        before = fingerprint(folder / "images")
+        (folder / "images" / "masks" / "other.png").rename(folder / "images" / "masks" / f"{NAMES[0]}.png")
+        assert fingerprint(folder / "images") != before, "masks belong to it"

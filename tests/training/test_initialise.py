@@ -19,7 +19,7 @@ from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.folder import ModelFolder
-from clsplat.training.initialise import RANDOM_POINTS
+from clsplat.training.initialise import RANDOM_POINTS, check_init
 from clsplat.training.initialise import initial_splats as initial_splats_of
 from clsplat.training.presets import PRESETS, preset
 
@@ -308,10 +308,15 @@ def test_files_of_any_format_are_a_start(tmp_path: Path, name: str) -> None:
         initial_splats(scene(0), init=str(tmp_path / "gone.spz"))
 
 
-def test_a_model_folder_is_no_start_but_its_file_is_named(tmp_path: Path) -> None:
-    model = ModelFolder(tmp_path / "model")
-    for iteration in (7, 30):
-        model.ply_path(iteration).parent.mkdir(parents=True)
-        saved(model.ply_path(iteration), "gaussian")
+def test_a_model_folder_is_no_start_but_its_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model folder may have the name of another start."""
+    for name in ("model", "random"):
+        model = ModelFolder(tmp_path / name)
+        for iteration in (7, 30):
+            model.ply_path(iteration).parent.mkdir(parents=True)
+            saved(model.ply_path(iteration), "gaussian")
+    monkeypatch.chdir(tmp_path)
+    check_init("random")
+    assert "at random" in initial_splats(scene(0), init="random")[1]
     with pytest.raises(InputError, match=r"is a model folder: name its file .*iteration_30/point_cloud.ply"):
         initial_splats(scene(0), init=str(tmp_path / "model"))

@@ -102,6 +102,18 @@ def find_photos(path: Path) -> list[PhotoFile]:
     ------
     InputError : the folder does not exist, has no photo of a supported format, or is a folder of scenes.
     """
+    files = _files_by_name(path)
+    in_folder = mask_files(path / MASK_FOLDER, files)
+    warn_of_unused(path / MASK_FOLDER, files, in_folder)
+    masks = masks_beside(files) | in_folder
+    return [
+        PhotoFile(scene_name, file, masks.get(name))
+        for (name, file), scene_name in zip(files.items(), _scene_names(list(files)), strict=True)
+    ]
+
+
+def _files_by_name(path: Path) -> dict[str, Path]:
+    """Return the photos of `find_photos` by their names in the folder, sorted. Errors are those of `find_photos`."""
     if not path.is_dir():
         known = ", ".join(sorted(VIDEO_SUFFIXES))
         kind = "is a file" if path.is_file() else "no such folder"
@@ -121,14 +133,7 @@ def find_photos(path: Path) -> list[PhotoFile]:
     for name in names:
         if not name.isprintable():  # a model's files cannot store line ends and names that are not UTF-8
             raise InputError(f"{home}: the name {name!a} cannot be written into a model; rename the photo")
-    folder, files = path / MASK_FOLDER, {name: home / name for name in names}
-    in_folder = mask_files(folder, files) if folder.is_dir() else {}
-    warn_of_unused(folder, files, in_folder)
-    masks = masks_beside(files) | in_folder
-    return [
-        PhotoFile(scene_name, home / name, masks.get(name))
-        for name, scene_name in zip(names, _scene_names(names), strict=True)
-    ]
+    return {name: home / name for name in names}
 
 
 def left_out_below(path: Path) -> str:
@@ -152,7 +157,9 @@ def fingerprint(path: Path) -> str:
     """
     if is_video(path):
         return file_digest(path)
-    files = [file for photo in find_photos(path) for file in (photo.file, photo.mask) if file is not None]
+    photos = _files_by_name(path)
+    masks = masks_beside(photos) | mask_files(path / MASK_FOLDER, photos)
+    files = [file for name, photo in photos.items() for file in (photo, masks.get(name)) if file is not None]
     digest = hashlib.sha256()
     for file in files:
         digest.update(os.fsencode(Path(os.path.relpath(file, path)).as_posix()) + f"\0{file_digest(file)}\0".encode())
