@@ -13,6 +13,7 @@ from .camera import Camera
 _SAMPLED_POINTS, _SAMPLED_VIEWS = 2000, 32
 
 T = TypeVar("T")
+Number = TypeVar("Number", bound=np.generic)
 
 
 class Seen(NamedTuple):
@@ -46,8 +47,8 @@ def seen(camera: Camera, xyz: NDArray[np.float64]) -> Seen:
     return Seen(depth, pixel, inside)
 
 
-def sampled(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return at most 2000 of the points (P, 3), evenly spread in their order: enough for what holds for all of them."""
+def sampled(xyz: NDArray[Number]) -> NDArray[Number]:
+    """Return at most 2000 of the points (P, ...), evenly spread in their order: enough for what holds for all."""
     return xyz[:: -(-len(xyz) // _SAMPLED_POINTS) or 1]
 
 

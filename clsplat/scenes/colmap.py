@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.seen import sampled
 from ..errors import InputError, reason_of
 from ..splats.quaternions import rotations
 from .colmap_binary import check_binary_model, count_registered
@@ -47,6 +48,11 @@ class Points:
 
 
 NO_POINTS = Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.int64))
+
+
+def few_of(points: Points) -> Points:
+    """Return the points that `sampled` takes, without the others in memory."""
+    return Points(sampled(points.xyz).copy(), sampled(points.rgb).copy(), sampled(points.track_length).copy())
 
 
 @dataclass(frozen=True, eq=False)

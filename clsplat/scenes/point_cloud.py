@@ -44,7 +44,9 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise InputError(f"{path}: has no property {missing[0]!r}; give a PLY file of points with x, y and z")
-    xyz: NDArray[np.float64] = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1)
+    xyz = np.empty((len(columns["x"]), 3))
+    for axis, name in enumerate("xyz"):
+        xyz[:, axis] = columns[name]
     bad = np.flatnonzero(~np.isfinite(xyz).all(axis=1))
     if bad.size:
         raise InputError(f"{path}: point {bad[0]} has a position that is not finite; export the points again")
@@ -57,6 +59,8 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
 
 def _bytes(colors: NDArray[Any]) -> NDArray[np.uint8]:
     """Return colours as 0 to 255. Files have them as bytes, as 16-bit numbers, or as reals up to 1 or 255."""
+    if colors.dtype == np.uint8:
+        return colors
     values = np.nan_to_num(colors.astype(np.float64), nan=GREY, posinf=255.0, neginf=0.0)
     if colors.dtype.kind == "f" and values.max(initial=0.0) <= 1.0:
         values = 255.0 * values

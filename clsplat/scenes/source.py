@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from ..errors import InputError
 from ..files.real_path import real_path
 from ..splats.color import Color
@@ -54,14 +56,20 @@ class SceneSource:
             _points_digest(scene),
         )
 
-    def load(self) -> Scene:
-        """Read the scene again.
+    def load(self, read_photos: bool = True) -> Scene:
+        """Read the scene again. read_photos : as of `load_scene`.
 
         Raises
         ------
         InputError : the files are missing, or they are not those that the scene was read from.
         """
-        loaded = load_scene(self.path, background=self.background, only=frozenset(self.names), **self.reading)
+        loaded = load_scene(
+            self.path,
+            background=self.background,
+            only=frozenset(self.names),
+            read_photos=read_photos,
+            **self.reading,
+        )
         views = {view.name: view for view in loaded.views}
         if missing := [name for name in self.names if name not in views]:
             raise InputError(f"{self.path}: the photo {missing[0]} is missing here: copy the scene's files again")
@@ -100,6 +108,6 @@ class SceneSource:
 def _points_digest(scene: Scene) -> str | None:
     if not len(scene.points):
         return None
-    result = hashlib.sha256(scene.points.xyz.tobytes())
-    result.update(scene.points.rgb.tobytes())
+    result = hashlib.sha256(np.ascontiguousarray(scene.points.xyz).data)
+    result.update(np.ascontiguousarray(scene.points.rgb).data)
     return result.hexdigest()

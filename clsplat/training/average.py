@@ -48,7 +48,13 @@ class ParameterAverage:
         self.count += 1
         for name, values in arrays.items():
             mean = self._mean.get(name)
-            self._mean[name] = values.copy() if mean is None else mean + (values - mean) / np.float32(self.count)
+            if mean is None:
+                self._mean[name] = values.copy()
+                continue
+            updated = values - mean
+            updated /= np.float32(self.count)  # in place: the arrays of a large model are most of the memory
+            updated += mean
+            self._mean[name] = updated
 
     def result(self) -> dict[str, Array]:
         """Return the mean of the samples."""

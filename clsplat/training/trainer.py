@@ -345,7 +345,7 @@ class Trainer:
         sound = finite_rows(arrays)
         if len(sound) and not sound.any():
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")
-        kept, kernels = {name: array[sound] for name, array in arrays.items()}, self.kernels
+        kept, kernels = arrays if sound.all() else {name: array[sound] for name, array in arrays.items()}, self.kernels
         numbers = kernels.near_plane, kernels.low_pass
         try:
             return Splats(kernels.shape, kept, kernels.normalisation, kernels.antialiased, *numbers)

@@ -18,6 +18,7 @@ from clsplat.blocks import train as module
 from clsplat.blocks.job import CONTEXT, START, BlockJob
 from clsplat.blocks.partition import Partition, make_partition, surroundings
 from clsplat.blocks.state import BlocksOptions, BlocksState
+from clsplat.blocks.targets import BlockTargets
 from clsplat.blocks.train import PICTURE, BlocksModel, partition_scene, train_in_blocks
 from clsplat.compression.search import train_budget
 from clsplat.errors import ClsplatError, InputError, OutputError
@@ -292,8 +293,8 @@ def test_new_points_do_not_change_what_a_block_learns(
     """The picture that it learns from is that of the coarse model, although its run begins with more splats."""
     pictured, begun = [], []
 
-    def targets(part: Scene, inside: Splats, *arguments: Any) -> Scene:
-        pictured.append(len(inside))
+    def targets(part: Scene, make: Callable[[], BlockTargets]) -> Scene:
+        pictured.append(len(make().inside))
         return part
 
     def run(config: TrainConfig, *arguments: Any) -> Any:

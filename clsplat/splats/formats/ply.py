@@ -11,10 +11,12 @@ values and store rarely used ones in elements after the vertices.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files.atomic import atomic_writer
@@ -42,6 +44,7 @@ from .ply_schema import (
 
 _ANTIALIASED = "SplatRenderMode: mip"
 _ANTIALIASED_ELSEWHERE = "antialiased 1"  # as PostShot writes it
+_ROWS_AT_ONCE = 1 << 16  # that are made and written at a time, so that a file of millions needs little memory
 
 
 def read_ply(path: str | os.PathLike[str]) -> StoredSplats:
@@ -108,7 +111,7 @@ def write_ply(
     """
     check_normalisation(normalisation)
     with np.errstate(over="ignore"):  # the check finds and names values that overflow
-        single = {name: np.asarray(values).astype(np.float32) for name, values in arrays.items()}
+        single = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
     schema = shape_named(shape).schema(sh_degree_for(single))
     check_arrays(schema, single)
     n = len(single["mean"])
@@ -120,23 +123,37 @@ def write_ply(
         fields = [sh_field(layout.base) if f.group is Group.SH else f for f in schema if f.name not in layout.sparse]
         schema = Schema(tuple(fields))
     names = [name for name in file_order(schema) if not compact or name not in NORMALS]
-    columns: dict[str, Array] = dict.fromkeys(names, np.zeros(n, dtype=np.float32))
-    for field in schema:
-        values = single[field.name]
-        flat = _channel_major(values) if field.group is Group.SH else values.reshape(n, field.width)
-        columns.update(zip(field.ply, flat.T, strict=True))
     head = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT} shape={shape} normalisation={normalisation}"]
     head += [f"comment {_ANTIALIASED}"] if antialiased else []
     head += [f"comment {comment}" for comment in NEAR_PLANES.comments(near_plane) + LOW_PASSES.comments(low_pass)]
-    for element, table in (("vertex", columns), *tables):
+    head += [f"element {VERTEX} {n}", *(f"property float {name}" for name in names)]
+    for element, table in tables:
         head.append(f"element {element} {len(next(iter(table.values())))}")
         head += [f"property {'float' if values.dtype.kind == 'f' else 'uint'} {name}" for name, values in table.items()]
     with atomic_writer(path) as stream:
         stream.write("".join(line + "\n" for line in (*head, "end_header")).encode("ascii"))
-        for table in (columns, *(table for _, table in tables)):
-            # Floats and uints alike are words of four bytes, rows of them one array.
-            words = [values.astype(values.dtype.newbyteorder("<")).view("<u4") for values in table.values()]
-            stream.write(np.stack(words, axis=1).tobytes())
+        for first in range(0, n, _ROWS_AT_ONCE):
+            rows = {name: values[first : first + _ROWS_AT_ONCE] for name, values in single.items()}
+            stream.write(_words(_columns(schema, rows, names)))
+        for _, table in tables:
+            stream.write(_words(table))
+
+
+def _columns(schema: Schema, arrays: Mapping[str, Array], names: Sequence[str]) -> dict[str, Array]:
+    """Return the columns with these names. Those that no field has are zero."""
+    n = len(arrays["mean"])
+    columns: dict[str, Array] = dict.fromkeys(names, np.zeros(n, dtype=np.float32))
+    for field in schema:
+        values = arrays[field.name]
+        flat = _channel_major(values) if field.group is Group.SH else values.reshape(n, field.width)
+        columns.update(zip(field.ply, flat.T, strict=True))
+    return columns
+
+
+def _words(table: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return the rows of a table as they stand in the file. Floats and uints alike are words of four bytes."""
+    words = [values.astype(values.dtype.newbyteorder("<")).view("<u4") for values in table.values()]
+    return np.stack(words, axis=1).tobytes()
 
 
 def _place(field: Field, fault: Fault) -> str:
@@ -165,9 +182,13 @@ def _gather(field: Field, columns: Mapping[str, Array], n: int) -> Array:
     """Return the public array of the field."""
     double = all(values.dtype == np.float64 for values in columns.values())
     dtype = np.dtype(np.float64 if double else np.float32)
+    flat: Array = np.empty((n, field.width), dtype)
+    coefficients = field.width // 3
     with np.errstate(over="ignore"):  # the check finds and names values that overflow
-        flat = np.stack([columns[name].astype(dtype) for name in field.ply], axis=1)
-    if field.group is Group.SH:
-        rest = flat[:, 3:].reshape(n, 3, field.width // 3 - 1).transpose(0, 2, 1)
-        return np.concatenate([flat[:, None, :3], rest], axis=1)
+        for number, name in enumerate(field.ply):
+            place = number
+            if field.group is Group.SH and number >= 3:  # the file has all of red, then green, then blue
+                channel, k = divmod(number - 3, coefficients - 1)
+                place = 3 * (k + 1) + channel
+            flat[:, place] = columns[name]
     return flat.reshape(public_shape(field, n))

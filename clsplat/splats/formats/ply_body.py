@@ -50,7 +50,8 @@ def _read_binary(path: object, stream: BinaryIO, header: Header) -> dict[str, di
             body[element.name] = {}
             continue
         table: NDArray[Any] = np.frombuffer(stream.read(element.count * dtype.itemsize), dtype=dtype)
-        body[element.name] = {name: table[name].astype(_CODES[kind]) for kind, name in element.properties}
+        # Columns in the byte order of the machine are views of the rows: a copy of each would double the memory.
+        body[element.name] = {name: table[name].astype(_CODES[kind], copy=False) for kind, name in element.properties}
     return body
 
 
