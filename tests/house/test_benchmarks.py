@@ -12,11 +12,13 @@ import blocks
 import budget
 import common
 import defaults
+import exposures
 import few_views
 import folds
 import formats
 import gsplat_steps
 import pytest
+from set_folders import as_blender
 
 from clsplat.scenes.scene import load_scene
 
@@ -249,6 +251,36 @@ def test_photos(tmp_path: Path, capture_folder: Path) -> None:
         assert len(row["PSNR"]) > 1
         assert row["corrected"] >= row["PSNR"][0] - 0.1
         assert f"{row['corrected']:.2f}" in done.stdout
+
+
+@pytest.mark.slow
+def test_exposures(tmp_path: Path, capture_folder: Path) -> None:
+    scene, out = as_blender(capture_folder, tmp_path / "transparent"), tmp_path / "exposures.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "exposures.py"), "--smoke", "--scenes", "transparent:1"]
+    command += ["--out", str(out), "--backgrounds", "grey"]
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["random_background"] for row in rows] == [False, True], "each once"
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit"} <= set(row)
+        assert 0.6 < row["found"] < 1, "it has begun to learn that the photos are darker"
+        assert f"| {row['found']:.3f} | {row['corrected']:.2f} |" in done.stdout
+
+
+def test_a_darker_photo_keeps_its_background(tmp_path: Path, capture_folder: Path) -> None:
+    grey = (0.5, 0.5, 0.5)
+    scene = load_scene(as_blender(capture_folder, tmp_path / "transparent"), background=grey)
+    some, darkened = exposures.some_darkened(scene, 4, 0.6)
+    assert darkened.sum() == 2
+    assert [view.name for view in some.test] == [view.name for view in scene.test]
+    before = {view.name: view.loaded() for view in scene.train}
+    for view, dark in zip(some.train, darkened, strict=True):
+        old, alpha = before[view.name].image.astype(float), view.alpha
+        assert alpha is not None
+        assert (view.image[alpha == 0] == 128).all()
+        assert view.image[alpha == 255] == pytest.approx(old[alpha == 255] * (0.6 if dark else 1.0), abs=0.51)
 
 
 def test_visible_adam(tmp_path: Path, capture_folder: Path) -> None:
