@@ -5,7 +5,7 @@
 const SMALLEST = 0.25;
 const FEWEST = 0.5;          // the part of the splats that stays
 const STEP = 1.05;           // factor of the size or of that part from one picture to the next
-const SLOW = 60, FAST = 25;  // time from one picture to the next [ms] above which the image shrinks, below which it grows
+const SLOW = 60, FAST = 25;  // time that a picture takes [ms] above which the image shrinks, below which it grows
 const REST = 250;            // time without a change [ms] after which the image has its full size
 const find = (id) => document.getElementById(id);
 
@@ -21,7 +21,7 @@ class Page {
     this.part = 1;      // part of its splats, below 1 only in the smallest image
     this.whole = true;  // whether the last picture had its full size, or the next one will
     this.ordered = false;  // whether a picture of full size waits for nothing but its drawing
-    this.gap = null;    // mean time between the pictures of a view that moves [ms]
+    this.gap = null;    // mean time that a picture of a view that moves takes [ms]
     this.cameras = settings.cameras.length ? settings.cameras : settings.tour.cameras;
     this.background = settings.background;
   }
@@ -87,7 +87,7 @@ class Page {
   key(event) {
     if (needsKeys(event.target)) return;
     const buttons = { ",": "previous", ".": "next", t: "tour", r: "reset", f: "fullscreen", h: "help-button" };
-    const button = buttons[event.key];
+    const button = buttons[event.key.toLowerCase()];
     if (button && !event.ctrlKey && !event.metaKey && !event.altKey) find(button).click();
   }
 
@@ -153,9 +153,17 @@ class Page {
     this.last = now;
     if (this.touring) this.tourStep(seconds);
     if (this.controls.advance(seconds)) this.changed = true;
+    const took = this.renderer.poll(now);
+    if (took !== null) this.adapt(took);
+    // A fast device may have the next picture while it still draws one. A slow one would only be more and more behind.
+    if (this.renderer.drawing.length < (this.gap !== null && this.gap < SLOW ? 2 : 1)) this.advance(now);
+    requestAnimationFrame((next) => this.frame(next));
+  }
+
+  // Draws a picture if one is due.
+  advance(now) {
     if (this.changed) {
-      this.adapt(now);
-      this.draw(this.share, now);
+      this.draw(this.share, now, true);
     } else if (now - this.lastDraw > REST && (!this.whole || this.gap !== null)) {
       this.gap = null;
       if (this.whole) this.describe();
@@ -163,7 +171,6 @@ class Page {
     } else if (this.ordered) {
       this.draw(1, now);
     }
-    requestAnimationFrame((next) => this.frame(next));
   }
 
   tourStep(seconds) {
@@ -184,21 +191,19 @@ class Page {
     else this.sorter.request(this.view);
   }
 
-  // Chooses the size of the next image, and the part of its splats, from the time since the last one.
-  adapt(now) {
-    const gap = now - (this.lastDraw || 0);
-    this.gap = gap > 1000 ? null : 0.9 * (this.gap || gap) + 0.1 * gap;
-    if (this.gap === null || gap <= 0) return;  // the view was at rest
-    if (gap > SLOW) {
+  // Chooses the size of the next image, and the part of its splats, from the time that one took [ms].
+  adapt(took) {
+    this.gap = 0.9 * (this.gap || took) + 0.1 * took;
+    if (took > SLOW) {
       if (this.share === SMALLEST) this.part = Math.max(this.part / STEP, FEWEST);
-      else this.share = Math.max(this.share * Math.sqrt(SLOW / gap), SMALLEST);
-    } else if (gap < FAST) {
+      else this.share = Math.max(this.share * Math.sqrt(SLOW / took), SMALLEST);
+    } else if (took < FAST) {
       if (this.part < 1) this.part = Math.min(this.part * STEP, 1);
       else this.share = Math.min(this.share * STEP, 1);
     }
   }
 
-  draw(share, now) {
+  draw(share, now, moving = false) {
     this.changed = this.ordered = false;
     this.whole = share === 1;
     this.lastDraw = now;
@@ -208,6 +213,7 @@ class Page {
     this.renderer.resize(width, height, share);
     if (!this.isPresent(this.sortedView)) this.sorter.request(this.view);
     this.renderer.draw(this.controls.pose, lensFor(this.camera, ...this.renderer.size), this.background);
+    this.renderer.note(now, moving);
     this.drawnView = this.sortedView;
     this.describe();
   }

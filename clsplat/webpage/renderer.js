@@ -36,6 +36,31 @@ class Renderer {
     this.count = null;  // number of splats in the order; null before there is one
     this.size = [0, 0];
     this.cutoff = FINE;
+    this.drawing = [];  // pictures that the device has not finished, the oldest first
+    this.done = 0;      // time at which the last picture was done [ms]
+  }
+
+  // Notes a picture that was drawn. WebGL only takes orders: the device finishes it later, or much later.
+  note(since, counts) {
+    const gl = this.gl;
+    this.drawing.push({ sync: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), since, counts });
+  }
+
+  // Forgets finished pictures. Returns how long each of those that count took [ms]; null if there are none.
+  poll(now) {
+    const gl = this.gl;
+    const isDone = ({ sync }) => gl.getSyncParameter(sync, gl.SYNC_STATUS) === gl.SIGNALED;
+    let finished = 0, counted = false;
+    const begun = this.drawing.length ? Math.max(this.drawing[0].since, this.done) : now;
+    while (this.drawing.length && isDone(this.drawing[0])) {
+      const { sync, counts } = this.drawing.shift();
+      gl.deleteSync(sync);
+      counted = counts;
+      finished += 1;
+    }
+    if (!finished) return null;
+    this.done = now;
+    return counted ? (now - begun) / finished : null;
   }
 
   program(vertex, fragment, outputs = null) {

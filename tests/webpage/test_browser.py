@@ -334,7 +334,7 @@ def test_a_double_click_makes_a_place_the_middle(page: Page) -> None:
 
 def test_help_lists_the_keys(page: Page) -> None:
     page.locator("#view").focus()
-    page.keyboard.press("h")
+    page.keyboard.press("H")  # as with Shift, or Caps Lock
     assert page.locator("#help").is_visible()
     assert "3,000 splats" in page.locator("#about").inner_text()
     page.keyboard.press("Escape")
@@ -342,9 +342,9 @@ def test_help_lists_the_keys(page: Page) -> None:
 
 
 def test_a_slow_device_gets_smaller_images_while_it_moves(page: Page) -> None:
-    page.evaluate("page.share = 1; page.changed = false; page.lastDraw = 0; page.adapt(200)")
+    page.evaluate("page.share = 1; page.changed = false; page.adapt(200)")
     assert page.evaluate("page.share") < 0.6
-    page.evaluate("for (let i = 1; i < 60; ++i) { page.lastDraw = 20 * i; page.adapt(20 * i + 20); }")
+    page.evaluate("for (let i = 1; i < 60; ++i) page.adapt(20);")
     assert page.evaluate("page.share") == 1
     page.evaluate("page.share = 0.5; page.changed = true")
     page.wait_for_function(f"page.renderer.size[0] < {WIDTH}")
@@ -352,17 +352,47 @@ def test_a_slow_device_gets_smaller_images_while_it_moves(page: Page) -> None:
     assert page.evaluate("page.renderer.size") == [WIDTH, HEIGHT], "a view at rest has its full size"
 
 
+def test_a_picture_takes_the_time_until_the_device_has_finished_it(page: Page) -> None:
+    """A picture of seconds returns at once: only a fence tells when it is there. Pictures at rest do not count."""
+    script = """() => {
+      const renderer = page.renderer, gl = renderer.gl, real = gl.getSyncParameter;
+      const before = [renderer.drawing, renderer.done];
+      let signaled = new Set();
+      gl.getSyncParameter = (sync) => signaled.has(sync) ? gl.SIGNALED : gl.UNSIGNALED;
+      [renderer.drawing, renderer.done] = [[], 100];
+      const found = [];
+      renderer.note(1000, true);
+      found.push(renderer.poll(1017), renderer.drawing.length);
+      renderer.note(1017, true);
+      signaled.add(renderer.drawing[0].sync);
+      found.push(renderer.poll(4000), renderer.drawing.length);
+      signaled.add(renderer.drawing[0].sync);
+      found.push(renderer.poll(6000), renderer.drawing.length);
+      renderer.note(7000, true);
+      renderer.note(7010, true);
+      renderer.drawing.forEach(({ sync }) => signaled.add(sync));
+      found.push(renderer.poll(7100));
+      renderer.note(8000, false);
+      signaled.add(renderer.drawing[0].sync);
+      found.push(renderer.poll(9000));
+      delete gl.getSyncParameter;
+      [renderer.drawing, renderer.done] = before;
+      return found;
+    }"""
+    assert page.evaluate(script) == [None, 1, 3000, 1, 2000, 0, 50, None]
+
+
 def test_the_smallest_images_have_fewer_splats_on_a_slow_device(page: Page) -> None:
     page.evaluate("page.frame = () => {}")  # no picture changes the sizes in between
     try:
-        page.evaluate("page.part = 1; page.share = SMALLEST; page.lastDraw = 0; page.adapt(200)")
+        page.evaluate("page.part = 1; page.share = SMALLEST; page.adapt(200)")
         assert page.evaluate("page.share") == page.evaluate("SMALLEST")
         assert page.evaluate("FEWEST < page.part && page.part < 1")
-        page.evaluate("for (let i = 1; i < 60; ++i) { page.lastDraw = 200 * i; page.adapt(200 * i + 200); }")
+        page.evaluate("for (let i = 1; i < 60; ++i) page.adapt(200);")
         assert page.evaluate("page.part === FEWEST")
-        page.evaluate("page.lastDraw = 0; page.adapt(20)")
+        page.evaluate("page.adapt(20)")
         assert page.evaluate("page.part > FEWEST && page.share === SMALLEST"), "the splats come back first"
-        page.evaluate("for (let i = 1; i < 90; ++i) { page.lastDraw = 20 * i; page.adapt(20 * i + 20); }")
+        page.evaluate("for (let i = 1; i < 90; ++i) page.adapt(20);")
         assert page.evaluate("[page.part, page.share]") == [1, 1]
     finally:
         page.evaluate("delete page.frame; requestAnimationFrame((now) => page.frame(now))")
