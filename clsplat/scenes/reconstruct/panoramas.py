@@ -25,6 +25,7 @@ from ...files.images import ImageU8, image_size, read_image, write_photo, write_
 from ...files.masks import MASK_FOLDER, Mask, read_mask, resize_mask
 from .photo_files import PhotoFile, StagedPhoto
 from .sfm_process import Step, StepCallback
+from .sphere_part import ASPECT, SpherePart, sphere_part
 
 Rotation = NDArray[np.float64]
 
@@ -32,9 +33,6 @@ FACE_FOCAL = 0.5  # focal length of a face, in its width
 
 _SIDES = ("front", "right", "back", "left")  # in this order, each turned by 90 degrees
 _TOP = "top"
-_XMP_BYTES = 1 << 18  # the XMP data of a JPEG are within this number of bytes
-_XMP_MARKS = (b"ProjectionType", b"equirectangular")  # of the name space GPano, which cameras write
-_ASPECT = 2.0
 _MAX_FACE = 4096  # largest width of a face [px]
 
 
@@ -53,24 +51,10 @@ def face_size(width: int) -> int:
     return min(max(2 * round(width / (2.0 * math.pi)), 2), _MAX_FACE)
 
 
-def is_panorama(photo: Path) -> bool:
-    """Return whether a photo is twice as wide as high and says that it is equirectangular.
-
-    Raises
-    ------
-    InputError : the photo cannot be read.
-    """
-    if not has_panorama_size(photo):
-        return False
-    with photo.open("rb") as stream:
-        start = stream.read(_XMP_BYTES)
-    return all(mark in start for mark in _XMP_MARKS)
-
-
 def has_panorama_size(photo: Path) -> bool:
     """Return whether a photo is twice as wide as high. Raises InputError if it cannot be read."""
     width, height = image_size(photo)
-    return width == _ASPECT * height
+    return width == ASPECT * height
 
 
 def with_faces(
@@ -95,7 +79,7 @@ def with_faces(
     if panoramas == "no":
         return photos
     readable = [photo.file for photo in photos if _is_readable(photo.file)]
-    found = sum(map(is_panorama, readable))
+    found = sum(sphere_part(photo) is not None for photo in readable)
     if panoramas == "auto" and found < len(readable):
         if found:
             raise InputError(
@@ -139,18 +123,24 @@ def cut_panoramas(photos: Sequence[PhotoFile], folder: Path, progress: Callable[
 
     Parameters
     ----------
-    photos : the panoramas. They may have different sizes.
+    photos : the panoramas. They may have different sizes, and show parts of the sphere (sphere_part.py). All faces have
+        the size that suits the largest, because a face has one camera in the search for poses.
     folder : folder to write to.
     progress : called with the number of panoramas that are done.
 
     Raises
     ------
-    InputError : a photo is not twice as wide as high, or its mask has another shape.
+    InputError : a photo is not twice as wide as high, its mask has another shape, or its mask hides all of its faces.
     OutputError : a face cannot be written.
     """
     cut: list[PhotoFile] = []
+    parts = [_part_of(photo) if _is_readable(photo.file) else None for photo in photos]
+    size = face_size(max((part.whole[0] for part in parts if part is not None), default=0))
     with ThreadPoolExecutor(2) as pool:  # more threads would hold more panoramas in memory
-        jobs = [pool.submit(lambda n, p: list(_faces_of(n, p, folder)), n, p) for n, p in enumerate(photos)]
+        jobs = [
+            pool.submit(lambda n, of, part: list(_faces_of(n, of, part, size, folder)), number, photo, part)
+            for number, (photo, part) in enumerate(zip(photos, parts, strict=True))
+        ]
         for done, job in enumerate(jobs, start=1):
             cut += job.result()
             progress(done)
@@ -180,45 +170,60 @@ def face_pairs(first: Sequence[str], second: Sequence[str], neighbours: bool) ->
                 yield a, b
 
 
-def _faces_of(number: int, photo: PhotoFile, folder: Path) -> Iterator[PhotoFile]:
-    """Write the faces of one panorama and yield them."""
-    try:
-        pixels = read_image(photo.file, upright=True)
-    except InputError:
-        yield photo
-        return
-    height, width = pixels.shape[:2]
-    if width != _ASPECT * height:
+def _part_of(photo: PhotoFile) -> SpherePart:
+    """Return the part of the sphere that a panorama shows: all of it, unless it says another one."""
+    if (part := sphere_part(photo.file)) is not None:
+        return part
+    width, height = image_size(photo.file)
+    if width != ASPECT * height:
         raise InputError(
             f"{photo.file}: is {width}x{height} px, a panorama is twice as wide as high",
             Remedy("leave it out"),
             Remedy("do not cut the photos", "--panoramas no"),
         )
+    return SpherePart((width, height), 0, 0, (width, height))
+
+
+def _faces_of(number: int, photo: PhotoFile, part: SpherePart | None, size: int, folder: Path) -> Iterator[PhotoFile]:
+    """Write the faces of one panorama that show something, and yield them. size : width of a face [px]."""
+    try:
+        pixels = read_image(photo.file, upright=True)
+    except InputError:
+        pixels = None
+    if pixels is None or part is None:
+        yield photo
+        return
     mask = None
     if photo.mask is not None:
         mask = read_mask(photo.mask)
-        if mask.shape[1] != _ASPECT * mask.shape[0]:
+        if mask.shape[1] * part.size[1] != part.size[0] * mask.shape[0]:
             raise InputError(f"{photo.mask}: is {mask.shape[1]}x{mask.shape[0]} px; make it as large as the panorama")
-        mask = resize_mask(mask, width, height)
+        mask = resize_mask(mask, *part.size)
+    if not part.is_whole:
+        pixels, mask = part.spread(pixels, mask)
     name = PurePosixPath(photo.name)
     ending = ".png" if pixels.shape[2] == 4 or name.suffix.lower() == ".png" else ".jpg"
-    for face in face_rotations():
-        shown = str(name.with_name(f"{name.stem}_{face}{ending}"))
-        file = folder / shown
-        write_photo(file, face_pixels(pixels, face))
-        mask_file = None
-        if mask is not None:
-            mask_file = folder / MASK_FOLDER / f"{shown}.png"
-            write_png(mask_file, np.where(face_mask(mask, face), 255, 0).astype(np.uint8))
-        yield PhotoFile(shown, file, mask_file, place=f"{face}/{number:06}")
+    masks = {face: None if mask is None else face_mask(mask, face, size) for face in face_rotations()}
+    shown = [face for face, shows in masks.items() if shows is None or shows.any()]
+    if not shown:
+        raise InputError(f"{photo.mask}: hides every face of {photo.file}: leave the photo out")
+    for face in shown:
+        new = str(name.with_name(f"{name.stem}_{face}{ending}"))
+        file = folder / new
+        write_photo(file, face_pixels(pixels, face, size))
+        mask_file, shows = None, masks[face]
+        if shows is not None:
+            mask_file = folder / MASK_FOLDER / f"{new}.png"
+            write_png(mask_file, np.where(shows, 255, 0).astype(np.uint8))
+        yield PhotoFile(new, file, mask_file, place=f"{face}/{number:06}")
 
 
-def face_pixels(panorama: ImageU8, face: str) -> ImageU8:
-    """Return a face of a panorama (H, 2 H, C) with bilinear interpolation: (S, S, C) with S = face_size(2 H)."""
+def face_pixels(panorama: ImageU8, face: str, size: int) -> ImageU8:
+    """Return a face (S, S, C) of a panorama (H, 2 H, C) with bilinear interpolation. size : S."""
     from scipy.ndimage import map_coordinates  # lazy: a slow import
 
     height, width = panorama.shape[:2]
-    rows, columns = _places(face, face_size(width), height, width)
+    rows, columns = _places(face, size, height, width)
     # The left edge continues at the right one.
     wide = np.pad(panorama, ((0, 0), (1, 1), (0, 0)), mode="wrap")
     layers = [
@@ -228,10 +233,10 @@ def face_pixels(panorama: ImageU8, face: str) -> ImageU8:
     return np.rint(np.stack(layers, axis=2)).astype(np.uint8)
 
 
-def face_mask(mask: Mask, face: str) -> Mask:
-    """Return a face of a panorama's mask (H, 2 H) with the nearest pixels: (S, S)."""
+def face_mask(mask: Mask, face: str, size: int) -> Mask:
+    """Return a face (S, S) of a panorama's mask (H, 2 H) with the nearest pixels. size : S."""
     height, width = mask.shape
-    rows, columns = _places(face, face_size(width), height, width)
+    rows, columns = _places(face, size, height, width)
     found: Mask = mask[np.rint(rows).astype(int).clip(0, height - 1), np.rint(columns).astype(int) % width]
     return found
 
