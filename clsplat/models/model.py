@@ -122,7 +122,8 @@ class LoadedModel:
         if choice.path is None:
             path = existing_scene(path, self.path)
         # A file of splats records nothing. Splats far away have the coordinates of the scene's files.
-        origin = self.origin if "origin" in record or is_far(self.splats.mean) else None
+        is_known = "origin" in record or is_far(self.splats.mean, self.splats.log_scale)
+        origin = self.origin if is_known else None
         test_names = self.test_names
         if test_names is not None and (choice.test_every or choice.test_list):
             leave_out = Remedy("leave out the choice of others", "--test-every", "--test-list")

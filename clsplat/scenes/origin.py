@@ -13,12 +13,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.seen import sampled, sampled_views
 from ..errors import InputError
 from ..splats.fields import Array
 from .posed_images import PosedImages
 
 # Largest distance from the origin in units of the scene's size. Beyond it, training in float32 loses image quality.
 FAR = 1e4
+# In a long scene details are small for its size. The step of float32 there may be this part of a pixel, or of a splat.
+_STEP_SHARE = 0.5
+_LONG = FAR / 100.0  # scenes nearer to the origin, in units of their size, are no case for this rule
+_NEAREST = 0.1  # part of the points in an image that are nearer than its details
+_FEWEST_POINTS = 5  # in an image, to tell where its details are
 _ROUNDING = 1e-14  # of the distance from the origin: places closer than this are one place
 _LOST = 1e10  # beyond this distance, float64 has lost the scene, too
 
@@ -46,7 +52,7 @@ def near_origin(root: Path, posed: PosedImages, size: float, origin: Sequence[fl
     if origin is None:
         place = ", ".join(f"{value:.15g}" for value in shift)
         warnings.warn(
-            f"{root}: is more than {FAR:g} times its size away from the origin, which float32 cannot hold: "
+            f"{root}: is too far from the origin for its size or its details, which float32 cannot hold: "
             f"({place}) becomes the origin of the scene and of its model",
             stacklevel=4,
         )
@@ -75,10 +81,19 @@ def camera_centres(posed: PosedImages) -> NDArray[np.float64]:
     return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
-def is_far(xyz: Array) -> bool:
-    """Return whether points, (N, 3), are further from the origin than scenes may be."""
+def is_far(xyz: Array, log_scale: Array) -> bool:
+    """Return whether splats are further from the origin than scenes may be.
+
+    Parameters
+    ----------
+    xyz : (N, 3) their positions. log_scale : (N, 3) logarithms of their standard deviations.
+    """
     wide = xyz.astype(np.float64)
-    return len(wide) > 0 and _ratio(np.median(wide, axis=0), _spread(wide) or 1.0) >= FAR
+    if not len(wide):
+        return False
+    centre = np.median(wide, axis=0)
+    ratio = _ratio(centre, _spread(wide) or 1.0)
+    return ratio >= FAR or (ratio >= _LONG and _is_coarse(centre, float(np.exp(np.median(log_scale.max(axis=1))))))
 
 
 def size_of(posed: PosedImages) -> float:
@@ -102,12 +117,40 @@ def _ratio(centre: NDArray[np.float64], size: float) -> float:
     return float(np.abs(centre).max()) / size
 
 
+def _is_coarse(centre: NDArray[np.float64], detail: float) -> bool:
+    """Return whether the step of float32 at a place is too large for details of this size."""
+    return float(np.spacing(np.float32(np.abs(centre).max()))) > _STEP_SHARE * detail
+
+
 def _round_point(posed: PosedImages, size: float) -> NDArray[np.float64]:
     """Return a round point inside a scene that is far from the origin; the origin for other scenes."""
     if not posed.photos:
         return np.zeros(3)
     centre = np.median(posed.points.xyz if len(posed.points) else camera_centres(posed), axis=0)
-    if not FAR <= _ratio(centre, size) <= _LOST:
+    ratio = _ratio(centre, size)
+    if not _LONG <= ratio <= _LOST:
+        return np.zeros(3)
+    if ratio < FAR and not ((detail := _size_of_pixel(posed)) and _is_coarse(centre, detail)):
         return np.zeros(3)
     unit = 10.0 ** np.ceil(np.log10(size))
     return np.asarray(np.round(centre / unit) * unit, np.float64)
+
+
+def _size_of_pixel(posed: PosedImages) -> float | None:
+    """Return the size of a pixel at what is near the cameras [world units], a median of photos; None if nothing tells.
+
+    Without points in the images, the way from camera to camera stands for the depth.
+    """
+    xyz, sizes = sampled(posed.points.xyz), list[float]()
+    for photo in sampled_views(posed.photos):
+        lens, pose = photo.lens, photo.cam_from_world
+        local = xyz @ pose[:3, :3].T + pose[:3, 3]
+        half = 0.5 * np.array([lens.width, lens.height]) / lens.mean_focal_length()
+        depth = local[(local[:, 2] > 0) & (np.abs(local[:, :2]) < half * local[:, 2:]).all(axis=1), 2]
+        if len(depth) >= _FEWEST_POINTS:
+            sizes.append(float(np.quantile(depth, _NEAREST)) / lens.mean_focal_length())
+    if sizes:
+        return float(np.median(sizes))
+    ways = np.linalg.norm(np.diff(camera_centres(posed), axis=0), axis=1)
+    focal = float(np.median([photo.lens.mean_focal_length() for photo in posed.photos]))
+    return float(np.median(ways)) / focal if len(ways) and np.median(ways) > 0 else None

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_runner import clsplat, error_of, run
-from small_scene import cloud, moved, write_garden, write_model
+from small_scene import cloud, model_views, moved, write_garden, write_model
 
 from clsplat.errors import InputError
 from clsplat.models.model import SceneChoice, load_model
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.colmap_binary import write_binary_model
+from clsplat.scenes.origin import is_far
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.scenes.source import SceneSource
 
 MAP = 4e6  # coordinates of a map [m]
@@ -57,6 +59,41 @@ def test_other_scenes_stay_where_they_are(garden: Path) -> None:
             scene = load_scene(garden)
             assert scene.origin == (0.0, 0.0, 0.0)
             assert "origin" not in clsplat("info", garden)
+
+
+@pytest.mark.parametrize("points", [True, False])
+def test_a_long_scene_is_moved_for_its_details(garden: Path, points: bool) -> None:
+    """Two places far from each other: the distance from the origin is small for the length of the scene."""
+    far, apart = 4e6, 4e3
+    rng = np.random.default_rng(5)
+    cloud = rng.normal(size=(80, 3)) + np.repeat([0.0, apart], 40)[:, None] * [1.0, 0.0, 0.0]
+
+    def read(shift: float) -> Scene:
+        views = []
+        for number, (view, pose) in enumerate(zip(model_views(), moved(shift=shift), strict=True)):
+            pose[:3, 3] -= pose[:3, :3] @ [apart if number > 4 else 0.0, 0.0, 0.0]
+            seen = view.point_index if points else view.point_index[:0]
+            views.append(replace(view, cam_from_world=pose, pixels=view.pixels[: len(seen)], point_index=seen))
+        xyz = cloud + shift if points else cloud[:0]
+        write_binary_model(garden / "sparse" / "0", views, xyz, np.zeros(xyz.shape, np.uint8))
+        return load_scene(garden)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        near = read(0.0)
+        assert near.origin == (0.0, 0.0, 0.0)
+    with pytest.warns(UserWarning, match=r"for its size or its details, which float32 cannot hold: \("):
+        scene = read(far)
+    for view, other in zip(scene.views, near.views, strict=True):
+        np.testing.assert_allclose(view.camera.position + scene.origin, other.camera.position + far, atol=1e-6)
+
+
+def test_splats_of_a_long_scene_that_was_not_moved_are_far() -> None:
+    """Models of earlier versions have no origin in their record. Their splats tell that the scene was not moved."""
+    xyz = np.random.default_rng(5).normal(size=(80, 3)) + np.repeat([0.0, 4e3], 40)[:, None] * [1.0, 0.0, 0.0]
+    assert is_far(xyz + 4e6, np.full((80, 3), np.log(0.02)))
+    assert not is_far(xyz + 4e6, np.full((80, 3), np.log(2.0)))
+    assert not is_far(xyz, np.full((80, 3), np.log(0.02)))
 
 
 def test_the_origin_can_be_chosen(garden: Path) -> None:
