@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .sweep_rows import ChartRow, chart_point, is_auto, with_front
-from .table import Record, group_key, summarise
+from .table import Record, scene_title, summarise
 
 
 def length_rows(records: Sequence[Record]) -> list[ChartRow]:
@@ -48,8 +48,8 @@ def with_shared_seeds(records: Sequence[Record]) -> list[Record]:
 
     Means over other seeds at each length would differ by the seeds, too.
     """
-    groups: dict[str, dict[int, set[int]]] = {}
-    keys = [group_key(record, ("seed", "iterations")) for record in records]
+    groups: dict[tuple[str, str, int], dict[int, set[int]]] = {}
+    keys = [(scene_title(record), record["system"], record["config"]["cap_max"]) for record in records]
     for key, record in zip(keys, records, strict=True):
         config = record["config"]
         groups.setdefault(key, {}).setdefault(config["iterations"], set()).add(config["seed"])

@@ -55,7 +55,8 @@ def curve_rows(records: Sequence[Record]) -> list[ChartRow]:
 def point_rows(records: Sequence[Record]) -> list[ChartRow]:
     """Return a point for each system and cap, as means over the seeds; scenes with a single cap are left out.
 
-    Points have the most frequent iterations of their scene; automatic runs may have any.
+    Points have the most frequent iterations of their scene, of equally frequent ones the largest; automatic runs may
+    have any.
 
     Returns
     -------
@@ -73,7 +74,8 @@ def point_rows(records: Sequence[Record]) -> list[ChartRow]:
         swept = [row for row in group if not row["auto"]]
         if len({row["cap"] for row in swept}) < 2:
             continue
-        usual = Counter(row["iterations"] for row in swept).most_common(1)[0][0]
+        known = Counter(row["iterations"] for row in swept)
+        usual = max(known, key=lambda iterations: (known[iterations], iterations))
         group = [row for row in group if row["auto"] or row["iterations"] == usual]
         for cost in COSTS:
             group = with_front(group, cost, f"front_{cost}")

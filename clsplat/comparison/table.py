@@ -191,9 +191,14 @@ def _row(group: Sequence[Record], measured: Sequence[str]) -> Record:
 
 
 def _differing(row: Record, rows: Sequence[Record]) -> str:
-    """Return the options that distinguish a row from others of its scene, cap and system, as " [key=value, ...]"."""
+    """Return the options that distinguish a row from others of its scene, cap and system, as " [key=value, ...]".
+
+    Runs of different lengths are one system, although some options are decided by the length.
+    """
     keys = ("scene", "cap", "system")
     others = [other for other in rows if all(other[key] == row[key] for key in keys)]
+    if len({other["iterations"] for other in others}) == len(others):
+        return ""
     differing = [key for key, value in row["config"].items() if any(o["config"].get(key) != value for o in others)]
     differing = [key for key in differing if key != "iterations"]  # iterations have a column
     options = ", ".join(f"{key}={row['config'][key]}" for key in differing)

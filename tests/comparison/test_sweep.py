@@ -27,7 +27,7 @@ from clsplat.comparison.sweep_rows import (
     write_rows,
 )
 from clsplat.comparison.sweep_tables import auto_table, equal_table, equal_time_table, seed_table
-from clsplat.comparison.table import Record
+from clsplat.comparison.table import Record, summarise
 from clsplat.errors import InputError, OutputError
 from clsplat.evaluation import chart_style
 from clsplat.files.html_page import Section, write_page
@@ -100,6 +100,31 @@ def test_runs_of_several_lengths_have_the_seeds_of_all_lengths() -> None:
     assert {row["seeds"] for row in rows if row["system"] == "gaussian"} == {1}
     apart = [run_record("3dgs", 500, 20.0, seed, iterations=n) for seed, n in ((0, 100), (1, 200))]
     assert with_shared_seeds(apart) == apart, "no seed has both lengths"
+
+
+def test_a_system_that_decides_by_the_length_is_one_system() -> None:
+    """Short runs have Gaussians by default, longer ones skew-normals. The reference of the charts is "default"."""
+    shapes = {100: "gaussian", 200: "gaussian", 400: "skew-normal"}
+    decided = [
+        run_record("default", cap, 20.0 + n / 100, shape=shapes[n], iterations=n) for cap in (500, 1000) for n in shapes
+    ]
+    others = [run_record("3dgs", cap, 19.0 + n / 100, iterations=n) for cap in (500, 1000) for n in shapes]
+    records = [*decided, *others]
+    assert {row["system"] for row in summarise(records)} == {"default", "3dgs"}
+    rows = length_rows(records)
+    assert [row["iterations"] for row in rows if row["system"] == "default"] == [100, 200, 400]
+    assert {row["system"] for row in equal_rows(point_rows(records), "default")} == {"3dgs"}
+    short = run_record("default", 1000, 30.0, 1, shape="gaussian", iterations=100)
+    assert short not in with_shared_seeds([*records, short]), "the longest has no seed 1"
+
+
+def test_points_of_equally_frequent_lengths_are_of_the_longest() -> None:
+    records = [
+        run_record("gaussian", cap, 20.0 + n / 100, iterations=n) for n in (100, 400, 200) for cap in (500, 1000)
+    ]
+    assert {row["iterations"] for row in point_rows(records)} == {400}
+    more = run_record("3dgs", 500, 20.0, iterations=100)
+    assert {row["iterations"] for row in point_rows([*records, more])} == {100}
 
 
 def test_leads_in_equal_time() -> None:
