@@ -49,9 +49,9 @@ _TEXT = {
     ),
     "size": (
         "Quality against render time, bytes and splats",
-        "Each point is a training run, or the mean over its seeds, all of the most frequent length, or of the longest if "
-        "several are as frequent. Grey: the Pareto front; no point is both better "
-        "and cheaper than a point of the front. Its points are labelled by the cap on splats. A star chose its number "
+        "Each point is a training run, or the mean over its seeds. All have the most frequent length, or the longest "
+        "if several are as frequent. Grey: the Pareto front; no point is both better and cheaper than a point of the "
+        "front. Its points are labelled by the cap on splats. A star chose its number "
         "of splats itself. Render time is the median over the test views of the fastest of five renders, on the "
         "host's clock; the protocol names the exceptions.",
     ),

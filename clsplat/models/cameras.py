@@ -18,7 +18,7 @@ from ..scenes.colmap import Points
 from ..scenes.export import points_file, relative_files, write_colmap, write_transforms
 from ..scenes.options import CAMERA_FORMATS
 from ..scenes.posed_images import warn_of_left_out
-from ..scenes.scene import read_posed_images
+from ..scenes.scene import find_masks, read_posed_images
 from ..scenes.scene_files import PHOTOGRAMMETRY_ENDINGS, is_opensfm
 from ..scenes.undistort import RegisteredImage, is_pinhole, make_lens, pinhole_camera
 from ..splats.harmonics import SH_C0
@@ -81,17 +81,20 @@ def export_cameras(
     if images is not None and not is_scene:
         raise InputError(f"{source}: is not a scene with photos; name a scene, or leave out the folder of photos")
     if is_scene:
-        photos, photo_files, points = _of_scene(source, images)
+        photos, photo_files, points, masks, held_out = _of_scene(source, images)
     else:
         photos, points = _of_model(source, iteration)
         photo_files = [output.parent / "images" / photo.name for photo in photos]
+        masks, held_out = [None] * len(photos), [False] * len(photos)
     if form == "cameras":
         _write_3dgs(output, photos)
         return ExportedCameras(len(photos), 0)
     if form == "transforms":
         if len(points):
             refuse_existing([points_file(output)], overwrite)
-        write_transforms(output, photos, relative_files(photo_files, output.parent), points)
+        place = output.parent
+        mask_paths = [None if mask is None else relative_files([mask], place)[0] for mask in masks]
+        write_transforms(output, photos, relative_files(photo_files, place), points, mask_paths, held_out)
     else:
         write_colmap(output, photos, points, form == "colmap-text")
     return ExportedCameras(len(photos), len(points))
@@ -109,16 +112,24 @@ def _is_scene(source: Path) -> bool:
     return isinstance(content, dict) and "frames" in content
 
 
-def _of_scene(scene: Path, images: str | None) -> tuple[list[RegisteredImage], list[Path], Points]:
-    """Return the photos, their files, and points. Names of photos omit a folder that all photos are in."""
+def _of_scene(
+    scene: Path, images: str | None
+) -> tuple[list[RegisteredImage], list[Path], Points, list[Path | None], list[bool]]:
+    """Return the photos, their files, points, masks, and which photos the scene's files hold out.
+
+    Names of photos omit a folder that all photos are in.
+    """
     posed = read_posed_images(scene, images)
     warn_of_left_out(scene, posed.left_out, len(posed.listed))
+    masks = find_masks(scene, posed, None)
     folders = {photo.name.partition("/")[0] if "/" in photo.name else None for photo in posed.photos}
     cut = len(folders.pop() or "") + 1 if len(folders) == 1 and None not in folders else 0
     return (
         [replace(photo, name=photo.name[cut:]) for photo in posed.photos],
         [posed.files[photo.name] for photo in posed.photos],
         posed.points,
+        [masks.get(photo.name) for photo in posed.photos],
+        [photo.name in (posed.test_names or ()) for photo in posed.photos],
     )
 
 

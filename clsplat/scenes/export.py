@@ -43,7 +43,14 @@ def points_file(transforms: Path) -> Path:
     return transforms.parent / POINTS_FILE if transforms.name == TRANSFORMS else transforms.with_suffix(".ply")
 
 
-def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Sequence[str], points: Points) -> None:
+def write_transforms(
+    path: Path,
+    photos: Sequence[RegisteredImage],
+    files: Sequence[str],
+    points: Points,
+    masks: Sequence[str | None] | None = None,
+    held_out: Sequence[bool] | None = None,
+) -> None:
     """Write a transforms.json with poses and lenses, and the points as a PLY file beside it.
 
     Parameters
@@ -52,6 +59,8 @@ def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Seque
     photos : registered images.
     files : `file_path` of each photo, relative to the folder of `path`.
     points : point cloud; not written if empty.
+    masks : `mask_path` of each photo, relative as `files`; None for photos without a mask.
+    held_out : whether each photo is a test photo. Without any, the file has no lists of photos.
 
     Raises
     ------
@@ -59,10 +68,14 @@ def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Seque
     OutputError : a file cannot be written.
     """
     frames = []
-    for photo, file in zip(photos, files, strict=True):
+    for photo, file, mask in zip(photos, files, masks or [None] * len(files), strict=True):
         pose = opengl_pose(photo.cam_from_world)
-        frames.append({"file_path": file} | _lens_keys(photo) | {"transform_matrix": pose.tolist()})
+        named = {"file_path": file} | ({} if mask is None else {"mask_path": mask})
+        frames.append(named | _lens_keys(photo) | {"transform_matrix": pose.tolist()})
     head: dict[str, Any] = {}
+    if held_out is not None and any(held_out):
+        for key, kind in (("train_filenames", False), ("test_filenames", True)):
+            head[key] = [file for file, is_test in zip(files, held_out, strict=True) if is_test is kind]
     if len(points):
         stored = points_file(path)
         write_point_cloud(stored, points)
@@ -71,7 +84,7 @@ def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Seque
     shared = {
         key: value
         for key, value in (frames[0] if frames else {}).items()
-        if key != "file_path" and all(frame.get(key) == value for frame in frames[1:])
+        if key not in ("file_path", "mask_path") and all(frame.get(key) == value for frame in frames[1:])
     }
     if len(frames) > 1:
         shared.pop("transform_matrix", None)

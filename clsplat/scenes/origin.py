@@ -137,7 +137,7 @@ def _round_point(posed: PosedImages, size: float) -> NDArray[np.float64]:
 
 
 def _size_of_pixel(posed: PosedImages) -> float | None:
-    """Return the size of a pixel at what is near the cameras [world units], a median of photos; None if nothing tells.
+    """Return the size of a pixel at what is near the cameras [world units], a median of photos; None if it is unknown.
 
     Without points in the images, the way from camera to camera stands for the depth.
     """

@@ -16,6 +16,12 @@ from .undistort import Lens, brown_lens, make_lens
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+# COLMAP's other lenses: transforms files have no keys for them.
+_COLMAP_ONLY = (
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_FISHEYE", "FOV", "DIVISION", "SIMPLE_DIVISION"),
+)
+_ANOTHER_WAY = "give the COLMAP model in its place, or undistort the photos first"
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # of nerfstudio's `distortion_params`, in its order
 _DEGREES = {"camera_angle_x": "x_fov", "camera_angle_y": "y_fov"}  # angles of instant-ngp in degrees
 _NO_PINHOLE = ("latlong", "equirectangular", "orthographic", "ftheta_p0")  # lenses of instant-ngp
@@ -53,7 +59,11 @@ class FrameLens:
         k1, k2, k3, k4, p1, p2 = self.distortion()
         model = str(self.value("camera_model") or "OPENCV").upper()
         if model in _FISHEYE or self.value("is_fisheye"):
+            if p1 or p2:
+                raise InputError(f"{self.place}: p1 and p2 of a fisheye lens are not supported; {_ANOTHER_WAY}")
             return make_lens("OPENCV_FISHEYE", width, height, [*core, k1, k2, k3, k4])
+        if model in _COLMAP_ONLY:
+            raise InputError(f"{self.place}: camera_model {model!r} is not supported here; {_ANOTHER_WAY}")
         if model not in _PERSPECTIVE:
             raise InputError(
                 f"{self.place}: camera_model {model!r} has no pinhole image; make perspective views "

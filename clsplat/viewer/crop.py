@@ -11,7 +11,9 @@ from ..errors import InputError
 from ..splats.fields import Array, DoubleArray
 from ..splats.quaternions import NORM_FLOOR, rotations
 
-_QUANTILES = (0.05, 0.95)  # of the coordinates inside the first box, so that stray splats do not stretch it
+# The first box is wider by a share of its size on each side than these quantiles of the coordinates. So stray splats do
+# not stretch it, and few others are outside.
+_QUANTILES, _MARGIN = (0.05, 0.95), 0.25
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _EDGES = [(i, j) for i in range(8) for j in range(i) if np.abs(_CORNERS[i] - _CORNERS[j]).sum() == 1.0]
 
@@ -73,7 +75,7 @@ def box_around(points: Array, up: DoubleArray) -> CropBox:
     axes = np.stack([first, np.cross(third, first), third], axis=1)
     local = points.astype(np.float64).reshape(-1, 3) @ axes
     low, high = np.quantile(local, _QUANTILES, axis=0) if len(local) else (-np.ones(3), np.ones(3))
-    size = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-3))
+    size = (1.0 + 2.0 * _MARGIN) * np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-3))
     return CropBox.of(axes @ (0.5 * (low + high)), quaternion_of(axes), size)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import threading
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from .numbered import save_numbered
 
 FILE_NAME = "cropped.ply"
 _COLOUR = (255, 200, 60)
+_DIGITS = 3  # of a size, after its first
 _HANDLE = 0.25  # size of a handle as a share of the box
 
 
@@ -111,6 +113,9 @@ class CropPanel:
         with self._client.atomic():
             if not self._on.value:
                 self._on.value = True
+            digits = _DIGITS - math.floor(math.log10(max(box.size)))
+            if self._size.step != 10.0**-digits:  # a small model needs more decimals
+                self._size.precision, self._size.step = max(digits, 0), 10.0**-digits
             if not np.allclose(self._size.value, box.size, rtol=1e-6):
                 self._size.value = box.size
             self._draw(box, moved)

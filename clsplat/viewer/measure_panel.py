@@ -16,6 +16,7 @@ from .source import Source
 
 _COLOUR = (90, 220, 120)
 _DOT = 0.006  # radius of a point, as a share of its distance to the camera
+_DIGITS = 6  # decimals of a real length
 _IDLE = "Measure a distance"
 _STARTED = "click the first of two points"
 
@@ -49,6 +50,7 @@ class MeasurePanel:
             self._real: Any = gui.add_number(
                 "Real length", 0.0, min=0.0, step=0.001, hint="Of this distance. It sets the scale of all others"
             )
+            self._real.precision = _DIGITS
             self._real.on_update(lambda _: self._calibrate())
 
     def model_changed(self) -> None:
@@ -61,6 +63,7 @@ class MeasurePanel:
             for item in self._drawn:
                 item.remove()
             self._drawn.clear()
+        self._client.scene.remove_click_callback()  # of a button that was pressed twice
         self._client.scene.on_click()(self._clicked)
         self._say(_STARTED)
 
@@ -72,7 +75,7 @@ class MeasurePanel:
             self._say("there is nothing to measure: click a point of the model")
             return
         with self._lock:
-            if len(self._points) >= 2:
+            if len(self._points) >= 2 or any((point == other).all() for other in self._points):
                 return
             self._points.append(point)
             ended = len(self._points) == 2

@@ -15,6 +15,7 @@ from small_scene import NAMES, write_garden
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.cameras.path import CameraPath, write_path
 from clsplat.errors import InputError
+from clsplat.files.images import write_png
 from clsplat.scenes.colmap import read_model
 from clsplat.scenes.export import relative_files, write_colmap, write_transforms
 from clsplat.scenes.posed_images import PosedImages
@@ -177,6 +178,27 @@ def test_names_that_a_colmap_model_cannot_store(garden: Path, tmp_path: Path, te
         with pytest.raises(InputError, match="cannot store this name; rename the photo"):
             write_colmap(tmp_path / "model", [photo], posed.points, text)
         assert not (tmp_path / "model").exists()
+
+
+def test_masks_and_held_out_photos_are_written(garden: Path, tmp_path: Path) -> None:
+    """Without them a run from the file would learn what masks hide, and the test photos."""
+    mask = np.full((30, 40), 255, np.uint8)
+    mask[:, :9] = 0
+    write_png(garden / "masks" / f"{NAMES[3]}.png", mask)
+    clsplat("cameras", garden, tmp_path / "one" / "transforms.json")
+    one = load_scene(tmp_path / "one")
+    assert [view.mask is not None for view in one.views] == [name == NAMES[3] for name in NAMES]
+    np.testing.assert_array_equal(one.views[3].mask, mask > 0)
+
+    values = json.loads((tmp_path / "one" / "transforms.json").read_text())
+    assert "test_filenames" not in values, "the scene holds out every eighth photo only if it is asked"
+    files = [frame["file_path"] for frame in values["frames"]]
+    lists = {"train_filenames": files[2:], "test_filenames": files[:2]}
+    (tmp_path / "one" / "transforms.json").write_text(json.dumps(values | lists))
+    clsplat("cameras", tmp_path / "one", tmp_path / "two" / "transforms.json")
+    two = load_scene(tmp_path / "two")
+    assert [Path(view.name).name for view in two.test] == NAMES[:2]
+    assert [view.mask is not None for view in two.views] == [name == NAMES[3] for name in NAMES]
 
 
 def test_cameras_of_a_transforms_file_are_those_of_its_scene(garden: Path, tmp_path: Path) -> None:

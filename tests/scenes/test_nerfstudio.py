@@ -357,6 +357,14 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (in_frame(equirectangular=True), "frame 1: equirectangular has no pinhole image"),
         (changed(ftheta_p0=0.2), "ftheta_p0 has no pinhole image"),
         (changed(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' has no pinhole image"),
+        (
+            changed(camera_model="THIN_PRISM_FISHEYE"),
+            "camera_model 'THIN_PRISM_FISHEYE' is not supported here; give the COLMAP model in its place, or undistort",
+        ),
+        (
+            changed(camera_model="OPENCV_FISHEYE", p1=0.01),
+            "p1 and p2 of a fisheye lens are not supported; give the COL",
+        ),
         (changed(ply_file_path="gone.ply"), r"ply_file_path .gone\.ply. is not a file: copy the points there, or"),
         (changed(ply_file_path="images"), "ply_file_path .images. is not a file"),
         (changed(fl_x=None, fl_y=None, K=[[1, 0], [0, 1]]), "K must be 3 x 3 numbers"),

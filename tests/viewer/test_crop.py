@@ -50,9 +50,11 @@ def test_the_first_box_is_upright_and_holds_nearly_all() -> None:
     box = box_around(np.concatenate([points, [(1e6, 0, 0)]]), up)
     assert np.allclose(box.axes[:, 2], up / math.sqrt(2))
     assert np.linalg.det(box.axes) == pytest.approx(1.0)
-    assert 0.6 < box.contains(points).mean() < 0.95
-    for few in (points[:1], points[:0], np.ones((5, 3))):
+    assert 0.95 < box.contains(points).mean() < 1.0
+    assert max(box.size) < 20.0, "one splat far away does not stretch it"
+    for few in (points[:1], points[:5], points[:0], np.ones((5, 3))):
         assert min(box_around(few, up).size) > 0.0
+        assert box_around(few, up).contains(few).all()
 
 
 @pytest.mark.parametrize(

@@ -260,7 +260,7 @@ def _wipe(models: Sequence[ModelReport], name: str) -> str:
         caption = "<span>render</span><span>photo</span>"
     return (
         f'<figure><div class="wipe" style="aspect-ratio: {width} / {height}">{images}'
-        f'<input type="range" min="0" max="100" step="any" value="50" '
+        f'<input type="range" min="0" max="100" step="any" value="50" autocomplete="off" '
         f'aria-label="Wipe between two images of {escape(name)}"></div>'
         f'<figcaption class="sides">{caption}</figcaption></figure>\n'
     )
@@ -271,7 +271,7 @@ def _choice(labels: Sequence[str], chosen: int, side: str) -> str:
         f'<option value="{key}"{" selected" if key == chosen else ""}>{escape(label)}</option>'
         for key, label in enumerate(labels)
     )
-    return f'<select aria-label="Image on the {side}">{options}</select>'
+    return f'<select autocomplete="off" aria-label="Image on the {side}">{options}</select>'
 
 
 def _map(uri: str, title: str, name: str, stops: str, full: float) -> str:

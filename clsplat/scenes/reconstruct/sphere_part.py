@@ -1,4 +1,4 @@
-"""What an equirectangular photo says of itself: the part of the sphere that it shows (the name space GPano of XMP)."""
+"""Equirectangular photos: the part of the sphere that each says it shows (the name space GPano of XMP)."""
 
 from __future__ import annotations
 

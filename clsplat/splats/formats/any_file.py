@@ -25,12 +25,13 @@ from .sog import META, is_sog, read_sog
 from .sog_writer import write_sog
 from .spz import VERSIONS as SPZ_VERSIONS
 from .spz import read_spz, write_spz
-from .spz_streams import is_spz
+from .spz_streams import GZIP_START, is_spz
 from .streamed_sog import LEVELS, LOD_META, read_streamed_sog, write_streamed_sog
 from .usd import USD_ENDINGS, is_usd, read_usd, write_usd
 
 PLY_ENDING, SPLAT_ENDING, SPZ_ENDING, SOG_ENDING = ".ply", ".splat", ".spz", ".sog"
 
+_PLY_STARTS = (b"ply\n", b"ply\r")
 _PAGE_START = b"<!DOCTYP"
 _ELSEWHERE = (".ksplat", ".lcc", ".lcc2")  # formats that splat-transform of PlayCanvas reads
 
@@ -65,6 +66,15 @@ WRITTEN = {
     **{ending: WrittenFormat(_EXTENDED, False) for ending in USD_ENDINGS},
     PAGE_ENDING: WrittenFormat(PAGE_SHAPES, True),
 }
+# For a beginning that says nothing: these readers say what is missing.
+_BY_ENDING: dict[str, Callable[[Path], StoredSplats]] = {
+    PAGE_ENDING: read_page,
+    GLB_ENDING: read_gltf_splats,
+    GLTF_ENDING: read_gltf_splats,
+    **dict.fromkeys(USD_ENDINGS, read_usd),
+    SPZ_ENDING: read_spz,
+    SOG_ENDING: read_sog,
+}
 READ_ENDINGS = (*WRITTEN, GLTF_ENDING)  # lod-meta.json ends a path too
 READ_NAMES = (META, LOD_META)  # JSON files that are models; all other ones are not
 
@@ -93,17 +103,23 @@ def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
 
 def _reader(path: Path, suffix: str, start: bytes) -> Callable[[Path], StoredSplats]:
     """Return the function that reads a file with this ending and this beginning."""
-    if suffix == SPLAT_ENDING:
-        return read_splat
-    if suffix == PAGE_ENDING or start == _PAGE_START:
+    if start.startswith(_PLY_STARTS):
+        return read_ply
+    if start == _PAGE_START:
         return read_page
-    if suffix in (GLB_ENDING, GLTF_ENDING) or is_glb(start):
+    if is_glb(start):
         return read_gltf_splats
-    if suffix in USD_ENDINGS or is_usd(start):
+    if is_usd(start):
+        if suffix not in USD_ENDINGS:
+            raise InputError(f"{path}: is an OpenUSD file, which needs its ending: rename it to {path.stem}.usd")
         return read_usd
-    if suffix == SPZ_ENDING or is_spz(start):
+    if is_sog(start):  # a zip archive
+        return read_usd if suffix in USD_ENDINGS else read_sog
+    if suffix == SPLAT_ENDING:  # its content has no mark; the first number may look like one of two bytes
+        return read_spz if start.startswith(GZIP_START) else read_splat
+    if is_spz(start):
         return read_spz
-    return read_sog if suffix == SOG_ENDING or path.name == META or is_sog(start) else read_ply
+    return _BY_ENDING.get(suffix, read_sog if path.name == META else read_ply)
 
 
 def write_splats(

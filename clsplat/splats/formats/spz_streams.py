@@ -42,6 +42,7 @@ RUB = 4  # the coordinate system of files without an extension: x right, y up, z
 _COORDINATE_SYSTEM = 0xADBE0003  # extension with the coordinate system as uint32
 _MAGIC = 0x5053474E
 _GZIP_MAGIC = b"\x1f\x8b"
+GZIP_START = _GZIP_MAGIC + b"\x08"  # with the only method of compression that there is
 _HEADER = struct.Struct("<IIIBBBB")
 _HEADER_4 = struct.Struct("<IIIBBBBI12x")
 _TABLE_ROW = struct.Struct("<QQ")

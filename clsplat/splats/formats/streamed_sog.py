@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..._version import __version__
 from ...errors import InputError, OutputError
-from ...files.atomic import atomic_writer
+from ...files.atomic import atomic_writer, move
 from ..fields import Array, DoubleArray
 from ..merging import Box, Level, boxes_of, leaves_of, levels_of
 from ..morton import morton_order
@@ -34,13 +36,14 @@ LEVELS, MAX_LEVELS = 4, 8  # by default, and at most
 _VERSION = 1
 _LEAF = 8192  # largest number of splats of a leaf at level 0
 _CHUNK = 1 << 18  # splats of a chunk, from which the next one begins
+_CHUNK_NAME = re.compile(r"\d+_\d+")  # level and number
 _MAX_DEPTH = 64  # of a tree that is read
 
 
 def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, levels: int) -> list[StoredSplats]:
     """Write lod-meta.json and the chunks beside it, and return the levels, the finest first.
 
-    Folders of chunks that an earlier lod-meta.json at this place names are removed.
+    Folders of chunks that an earlier lod-meta.json at this place names are replaced, once the new ones are complete.
 
     Parameters
     ----------
@@ -50,7 +53,7 @@ def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, level
     Raises
     ------
     InputError : the shape is not Gaussian, there is no splat, or the number of levels is out of range.
-    OutputError : a file cannot be written.
+    OutputError : a file cannot be written, or a folder has the name of a chunk and is none.
     """
     path = Path(path)
     check_gaussian(path, splats.shape, LOD_META)
@@ -58,14 +61,15 @@ def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, level
         raise InputError(f"{path}: {levels} levels: choose 1 to {MAX_LEVELS}")
     if not len(splats.arrays["mean"]):
         raise InputError(f"{path}: the model has no splats; train it first")
+    _refuse_foreign(path)
     leaves = leaves_of(splats.arrays["mean"], _LEAF)
     found = levels_of(splats.arrays, leaves, levels)
     stored = [splats, *(replace(splats, arrays=level.arrays()) for level in found[1:])]
-    _remove_chunks(path)
     filenames: list[str] = []
     runs: list[dict[str, Any]] = [{} for _ in leaves]
-    for number, (level, part) in enumerate(zip(found, stored, strict=True)):
-        filenames += list(_write_level(path, number, level, part, runs, len(filenames)))
+    with _replaced_chunks(path) as folder:
+        for number, (level, part) in enumerate(zip(found, stored, strict=True)):
+            filenames += list(_write_level(path, folder, number, level, part, runs, len(filenames)))
     errors = np.stack([np.bincount(level.group, level.error, len(leaves)) for level in found], axis=1)
     boxes = boxes_of(found, len(leaves))
     tree = _tree(splats.arrays["mean"], leaves, runs, np.maximum.accumulate(errors, axis=1), boxes)
@@ -82,6 +86,32 @@ def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, level
     with atomic_writer(path) as stream:
         stream.write(json.dumps(document, separators=(",", ":")).encode())
     return stored
+
+
+@contextmanager
+def _replaced_chunks(path: Path) -> Iterator[Path]:
+    """Yield a folder for new chunks, which replace the old ones if the block succeeds."""
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield unfinished
+        for name in _chunks(path):
+            shutil.rmtree(path.parent / name)
+        for folder in sorted(unfinished.iterdir()):
+            move(folder, path.parent / folder.name)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: its chunks cannot be written ({error.strerror or error}); choose another place"
+        ) from None
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _refuse_foreign(path: Path) -> None:
+    """Raise OutputError if a folder has the name of a chunk, but is not one of the lod-meta.json that is there."""
+    known = _chunks(path)
+    for folder in sorted(path.parent.iterdir()) if path.parent.is_dir() else ():
+        if _CHUNK_NAME.fullmatch(folder.name) and folder.name not in known:
+            raise OutputError(f"{folder}: is not of {path.name}, but a chunk would get its name; remove it")
 
 
 def _tree(
@@ -110,9 +140,9 @@ def _tree(
 
 
 def _write_level(
-    path: Path, number: int, level: Level, splats: StoredSplats, runs: list[dict[str, Any]], files: int
+    path: Path, folder: Path, number: int, level: Level, splats: StoredSplats, runs: list[dict[str, Any]], files: int
 ) -> Iterator[str]:
-    """Write the chunks of a level, add the runs of its leaves, and yield the paths of the chunks."""
+    """Write the chunks of a level into a folder, add the runs of its leaves, and yield the paths of the chunks."""
     rows = np.lexsort((np.argsort(morton_order(level.mean)), level.group))
     counts = np.bincount(level.group, minlength=len(runs))
     ends = np.cumsum(counts)
@@ -127,7 +157,7 @@ def _write_level(
                 runs[one][str(number)] = {"file": files + chunk, "offset": offset, "count": int(counts[one])}
         name = f"{number}_{chunk}"
         for file, data in sog_files(path, splats, rows[start : ends[last]]).items():
-            with atomic_writer(path.parent / name / file) as stream:
+            with atomic_writer(folder / name / file) as stream:
                 stream.write(data)
         yield f"{name}/{META}"
         start, leaf, chunk = int(ends[last]), last + 1, chunk + 1
@@ -138,22 +168,20 @@ def _short(value: float) -> float:
     return float(f"{value:.7g}")
 
 
-def _remove_chunks(path: Path) -> None:
-    """Remove the chunks of the lod-meta.json that is there."""
+def _chunks(path: Path) -> set[str]:
+    """Return the names of the folders beside lod-meta.json that are its chunks; none if there is no such file."""
     if not path.is_file():
-        return
+        return set()
     try:
         names = json.loads(path.read_bytes())["filenames"]
         folders = {Path(name).parts[0] for name in names if len(Path(name).parts) == 2 and ".." not in name}
+        return {name for name in folders if _is_chunk(path.parent / name)}
     except (OSError, ValueError, KeyError, TypeError):
-        return
-    for name in folders:
-        folder = path.parent / name
-        if (folder / META).is_file() and all(file.suffix in (".webp", ".json") for file in folder.iterdir()):
-            try:
-                shutil.rmtree(folder)
-            except OSError as error:
-                raise OutputError(f"{folder}: cannot be replaced ({error.strerror or error}); remove it") from None
+        return set()
+
+
+def _is_chunk(folder: Path) -> bool:
+    return (folder / META).is_file() and all(file.suffix in (".webp", ".json") for file in folder.iterdir())
 
 
 def read_streamed_sog(path: Path) -> StoredSplats:

@@ -29,6 +29,22 @@ def test_the_content_decides(tmp_path: Path, ending: str) -> None:
         np.testing.assert_array_equal(Splats.load(tmp_path / name).mean, wanted.mean)
 
 
+@pytest.mark.parametrize("ending", [".splat", ".glb", ".spz", ".sog", ".html", ".ply"])
+@pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", ".glb"])
+def test_a_wrong_ending_does_not_matter(tmp_path: Path, kind: str, ending: str) -> None:
+    """A .splat has no mark: a file of any other format would be read as some splats, if its length fits."""
+    some().save(tmp_path / f"a{kind}")
+    expected = Splats.load(tmp_path / f"a{kind}")
+    renamed = (tmp_path / f"a{kind}").rename(tmp_path / f"b{ending}")
+    np.testing.assert_array_equal(Splats.load(renamed).mean, expected.mean)
+
+
+def test_an_openusd_file_with_another_ending_says_so(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(b"#usda 1.0")
+    with pytest.raises(InputError, match=r"a.ply: is an OpenUSD file, which needs its ending: rename it to a.usd"):
+        Splats.load(tmp_path / "a.ply")
+
+
 def test_compressed_ply_needs_no_special_name(tmp_path: Path) -> None:
     packed_ply.write(tmp_path / "model.ply", packed_ply.some(300, 2))
     assert len(Splats.load(tmp_path / "model.ply")) == 300

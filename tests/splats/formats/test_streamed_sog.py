@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -17,6 +18,7 @@ from clsplat.files.images import decode_pixels, encode_pixels
 from clsplat.splats.formats import streamed_sog
 from clsplat.splats.formats.any_file import stored_bytes
 from clsplat.splats.formats.sog import read_sog
+from clsplat.splats.formats.sog_writer import sog_files
 from clsplat.splats.formats.streamed_sog import LOD_META, write_streamed_sog
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import GAUSSIAN
@@ -120,6 +122,33 @@ def test_equal_models_give_equal_files_and_old_chunks_go(path: Path) -> None:
     left = {file.relative_to(path.parent).parts[0] for file in path.parent.rglob("*.webp")}
     assert left == {name for name in {n.parts[0] for n in first} if name.startswith("0_")}
     assert (path.parent / "mine" / "note.txt").exists()
+
+
+def test_a_folder_that_is_not_a_chunk_of_the_file_is_kept(path: Path) -> None:
+    mine = path.parent / "0_0" / "meta.json"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    with pytest.raises(OutputError, match=r"0_0: is not of lod-meta.json, but a chunk would get its name; remove it"):
+        write_streamed_sog(path, model(), 2)
+    assert mine.read_text() == "mine"
+    assert [file.name for file in path.parent.iterdir()] == ["0_0"]
+
+
+def test_a_disk_that_becomes_full_leaves_the_old_chunks(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_streamed_sog(path, model(), 4)
+    before = {file: file.read_bytes() for file in path.parent.rglob("*") if file.is_file()}
+    written = []
+
+    def full(*arguments: Any) -> dict[str, bytes]:
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written.append(sog_files(*arguments))
+        return written[-1]
+
+    monkeypatch.setattr(streamed_sog, "sog_files", full)
+    with pytest.raises(OutputError, match=r"lod-meta.json: its chunks cannot be written"):
+        write_streamed_sog(path, model(200), 4)
+    assert {file: file.read_bytes() for file in path.parent.rglob("*") if file.is_file()} == before
 
 
 def test_an_unusable_splat_is_left_out_alone(path: Path) -> None:
