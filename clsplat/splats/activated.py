@@ -32,9 +32,12 @@ def activated(splats: StoredSplats, signs: Signs) -> dict[str, Array]:
 
     splats : of a shape in EXTRA_FIELDS.
     """
-    largest = float(splats.arrays["log_scale"].max(initial=-np.inf))
-    if largest > _LARGEST_LOG_SCALE:
-        raise InputError(f"a splat has the scale e^{largest:.4g}, which float32 does not hold: remove it first")
+    largest = splats.arrays["log_scale"].max(axis=1, initial=-np.inf)
+    if (largest > _LARGEST_LOG_SCALE).any():
+        number = int(np.argmax(largest))
+        raise InputError(
+            f"splat {number} has the scale e^{largest[number]:.4g}, which float32 does not hold: remove it first"
+        )
     values = flipped(splats.arrays, signs)
     raw = {name: splats.arrays[name].astype(np.float64) for name in _ACTIVATED}
     quat = values["quat"].astype(np.float64)

@@ -153,6 +153,16 @@ class ModelFolder:
             reason = error.strerror or error
             raise OutputError(f"{self.path}: cannot be written ({reason}): choose another folder") from None
 
+    def check_space(self, nbytes: int) -> None:
+        """Raise OutputError if the disk is too full for so many bytes, also without an earlier model in the folder."""
+        replaced = [self.checkpoint_path, *(self.ply_path(iteration) for iteration in self.iterations())]
+        free = shutil.disk_usage(self.path).free + sum(path.stat().st_size for path in replaced if path.is_file())
+        if free < nbytes:
+            raise OutputError(
+                f"{self.path}: its disk has {free / 1e6:.3g} MB for a model and a checkpoint, which need at least "
+                f"{nbytes / 1e6:.3g} MB: free some space, or choose another folder"
+            )
+
     def clear(self) -> None:
         """Remove the files of an earlier run, and nothing else."""
         for path in (

@@ -7,12 +7,15 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
+
 from ..device.several import open_devices
 from ..device.specs import first_device
 from ..errors import InputError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
+from ..splats.fields import Group
 from ..splats.splats import Splats
 from .config import TrainConfig
 from .decisions import as_decided, decide
@@ -26,6 +29,8 @@ from .model import Model
 from .trainer import Trainer, Visit
 
 __all__ = ["Model", "Progress", "train"]
+
+_STORED_COPIES = 4  # of all parameters: the model, and the checkpoint with two moments of the optimizer
 
 
 def train(
@@ -58,7 +63,7 @@ def train(
     Raises
     ------
     InputError : the scene has no training views, or the checkpoint does not fit.
-    OutputError : `output` holds a model, another run writes into it, or it cannot be written.
+    OutputError : `output` holds a model, another run writes into it, it cannot be written, or its disk is too full.
     DeviceError : the device has too little memory.
     TrainingError : the loss is not finite; the last checkpoint is kept.
     """
@@ -79,10 +84,18 @@ def train(
         trainer = Trainer(scene, config, checkpoint, progress, context=context)
         if folder is not None:
             if checkpoint is None:
+                folder.check_space(_least_bytes(trainer))
                 folder.clear()
             folder.write_run(config.to_json(), trainer.scene)
             folder.write_views([*scene.test, *trainer.scene.validation, *trainer.scene.train])
         return trainer.run(folder, visit)
+
+
+def _least_bytes(trainer: Trainer) -> int:
+    """Return the bytes of a model and its checkpoint with as many splats as a run begins with."""
+    schema = trainer.splats.schema
+    numbers = trainer.splats.n * sum(schema.rows(group) for group in Group)
+    return _STORED_COPIES * numbers * np.dtype(np.float32).itemsize
 
 
 def check_start(config: TrainConfig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -56,6 +57,22 @@ def test_a_disk_that_fills_up_keeps_the_last_checkpoint(capture_folder: Path, tm
         assert folder.ply_path(60).read_bytes() == ModelFolder(tmp_path / "peace").ply_path(60).read_bytes()
 
 
+def test_a_disk_that_is_too_small_for_a_run_keeps_the_old_model(capture_folder: Path, tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", "size=2m", "tmpfs") as disk:
+        folder = ModelFolder(disk / "model")
+        clsplat("train", capture_folder, "-m", folder.path, "--quiet", *SHORT)
+        before = {file: file.read_bytes() for file in folder.path.rglob("*") if file.is_file()}
+        larger = ["--overwrite", *SHORT, "--init", "random", "--cap-max", 20_000]
+        message = error_of("train", capture_folder, "-m", folder.path, *larger)
+        need = re.search(r"its disk has (\S+) MB for a model and a checkpoint, which need at least (\S+) MB", message)
+        assert need is not None
+        assert 1.5 < float(need[1]) < 2.1, "with what the old model takes"
+        assert float(need[2]) > 2.1
+        assert "free some space, or choose another folder" in message
+        assert {file: file.read_bytes() for file in folder.path.rglob("*") if file.is_file()} == before
+        clsplat("train", capture_folder, "-m", folder.path, "--quiet", "--overwrite", *SHORT)
+
+
 def test_a_full_disk_keeps_old_files(model_folder: Path, tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", "size=64k", "tmpfs") as disk:
         for name in ("a.ply", "a.spz", "a.splat", "t.json"):
@@ -67,7 +84,7 @@ def test_a_full_disk_keeps_old_files(model_folder: Path, tmp_path: Path) -> None
             assert "No space left" in error_of("convert", model_folder, disk / name, "--approximate", "--overwrite")
         assert "No space left" in error_of("cameras", model_folder, disk / "t.json", "--overwrite")
         assert "No space left" in error_of("render", model_folder, "-o", disk / "renders", "--quiet")
-        assert "No space left" in error_of("train", small_scene(model_folder), "-m", disk / "model", *SHORT)
+        assert "its disk has 0 MB" in error_of("train", small_scene(model_folder), "-m", disk / "model", *SHORT)
         for name in ("a.ply", "a.spz", "a.splat", "t.json"):
             assert (disk / name).read_bytes() == b"old"
 

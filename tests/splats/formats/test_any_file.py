@@ -142,7 +142,7 @@ def test_a_scale_that_float32_does_not_hold_is_not_written(tmp_path: Path, endin
     splats = some()
     log_scale = splats.log_scale.copy()
     log_scale[2, 0] = 90.0
-    with pytest.raises(InputError, match=r"a splat has the scale e\^90, which float32 does not hold"):
+    with pytest.raises(InputError, match=r"splat 2 has the scale e\^90, which float32 does not hold"):
         splats.with_arrays(splats.to_numpy() | {"log_scale": log_scale}).save(tmp_path / f"a{ending}")
     assert not (tmp_path / f"a{ending}").exists()
 
