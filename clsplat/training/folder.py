@@ -154,7 +154,7 @@ class ModelFolder:
             raise OutputError(f"{self.path}: cannot be written ({reason}): choose another folder") from None
 
     def check_space(self, nbytes: int) -> None:
-        """Raise OutputError if the disk is too full for so many bytes, also without an earlier model in the folder."""
+        """Raise OutputError if the disk has less room than `nbytes`, also without an earlier model in the folder."""
         replaced = [self.checkpoint_path, *(self.ply_path(iteration) for iteration in self.iterations())]
         free = shutil.disk_usage(self.path).free + sum(path.stat().st_size for path in replaced if path.is_file())
         if free < nbytes:

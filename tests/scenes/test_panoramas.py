@@ -230,6 +230,14 @@ def test_panoramas_of_two_sizes_have_faces_of_one_size(tmp_path: Path) -> None:
     assert {read_image(face.file).shape for face in faces} == {(face_size(96), face_size(96), 3)}
 
 
+def test_a_panorama_that_exif_turns_is_refused(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # orientation
+    Image.fromarray(np.zeros((32, 64, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    with pytest.raises(InputError, match=r"a.jpg: its EXIF data turn it by 90 degrees, .*; store it upright"):
+        cut_panoramas([PhotoFile("a.jpg", tmp_path / "a.jpg")], tmp_path / "f", lambda n: None)
+
+
 def test_a_mask_that_hides_a_whole_panorama(tmp_path: Path) -> None:
     file = put(tmp_path / "a.png", np.zeros((32, 64, 3), np.uint8))
     write_png(tmp_path / "mask.png", np.zeros((32, 64), np.uint8))

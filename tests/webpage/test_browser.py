@@ -353,7 +353,7 @@ def test_a_slow_device_gets_smaller_images_while_it_moves(page: Page) -> None:
 
 
 def test_a_picture_takes_the_time_until_the_device_has_finished_it(page: Page) -> None:
-    """A picture of seconds returns at once: only a fence tells when it is there. Pictures at rest do not count."""
+    """A picture of seconds returns at once: a fence is signaled when it is there. Pictures at rest do not count."""
     script = """() => {
       const renderer = page.renderer, gl = renderer.gl, real = gl.getSyncParameter;
       const before = [renderer.drawing, renderer.done];

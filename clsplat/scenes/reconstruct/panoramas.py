@@ -193,6 +193,8 @@ def _faces_of(number: int, photo: PhotoFile, part: SpherePart | None, size: int,
     if pixels is None or part is None:
         yield photo
         return
+    if pixels.shape[1::-1] != part.size:
+        raise InputError(f"{photo.file}: its EXIF data turn it by 90 degrees, which is no panorama; store it upright")
     mask = None
     if photo.mask is not None:
         mask = read_mask(photo.mask)

@@ -53,7 +53,7 @@ def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, level
     Raises
     ------
     InputError : the shape is not Gaussian, there is no splat, or the number of levels is out of range.
-    OutputError : a file cannot be written, or a folder has the name of a chunk and is none.
+    OutputError : a file cannot be written, or another folder has the name of a chunk.
     """
     path = Path(path)
     check_gaussian(path, splats.shape, LOD_META)
