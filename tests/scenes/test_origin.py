@@ -63,15 +63,15 @@ def test_other_scenes_stay_where_they_are(garden: Path) -> None:
 
 @pytest.mark.parametrize("points", [True, False])
 def test_a_long_scene_is_moved_for_its_details(garden: Path, points: bool) -> None:
-    """Two places far from each other: the distance from the origin is small for the length of the scene."""
+    """Three places far from each other: the distance from the origin is small for the length of the scene."""
     far, apart = 4e6, 4e3
     rng = np.random.default_rng(5)
-    cloud = rng.normal(size=(80, 3)) + np.repeat([0.0, apart], 40)[:, None] * [1.0, 0.0, 0.0]
+    cloud = rng.normal(size=(120, 3)) + apart * np.repeat([0, 1, 2], 40)[:, None] * [1.0, 0.0, 0.0]
 
     def read(shift: float) -> Scene:
         views = []
         for number, (view, pose) in enumerate(zip(model_views(), moved(shift=shift), strict=True)):
-            pose[:3, 3] -= pose[:3, :3] @ [apart if number > 4 else 0.0, 0.0, 0.0]
+            pose[:3, 3] -= pose[:3, :3] @ [apart * (number // 3), 0.0, 0.0]
             seen = view.point_index if points else view.point_index[:0]
             views.append(replace(view, cam_from_world=pose, pixels=view.pixels[: len(seen)], point_index=seen))
         xyz = cloud + shift if points else cloud[:0]
