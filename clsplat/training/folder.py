@@ -156,8 +156,9 @@ class ModelFolder:
     def check_space(self, nbytes: int) -> None:
         """Raise OutputError if the disk has less room than `nbytes`, also without an earlier model in the folder."""
         replaced = [self.checkpoint_path, *(self.ply_path(iteration) for iteration in self.iterations())]
-        free = shutil.disk_usage(self.path).free + sum(path.stat().st_size for path in replaced if path.is_file())
-        if free < nbytes:
+        disk = shutil.disk_usage(self.path)
+        free = disk.free + sum(path.stat().st_size for path in replaced if path.is_file())
+        if disk.total and free < nbytes:  # some network disks have no size
             raise OutputError(
                 f"{self.path}: its disk has {free / 1e6:.3g} MB for a model and a checkpoint, which need at least "
                 f"{nbytes / 1e6:.3g} MB: free some space, or choose another folder"
