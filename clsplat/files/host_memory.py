@@ -16,26 +16,32 @@ def available_bytes() -> int:
     if sys.platform == "win32":
         free = windows.available_bytes()
         return _UNLIMITED if free is None else free
-    try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            for line in file:
-                if line.startswith("MemAvailable:"):
-                    return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    return _UNLIMITED
+    stated = _of_table("/proc/meminfo", "MemAvailable:")
+    return _UNLIMITED if stated is None else stated
 
 
 def peak_bytes() -> int:
     """Return the peak memory of this process; 0 if the system does not report it."""
     if sys.platform == "win32":
         return windows.peak_bytes()
+    # The system call would also count the memory of the program that has started this one.
+    if sys.platform == "linux" and (stated := _of_table("/proc/self/status", "VmHWM:")) is not None:
+        return stated
     try:
         import resource
     except ImportError:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # bytes on macOS, KiB on Linux
+
+
+def _of_table(path: str, name: str) -> int | None:
+    """Return the bytes in the line of a table of the Linux kernel that begins with a name; None without one."""
+    try:
+        with open(path, encoding="ascii", errors="replace") as file:
+            return next((int(line.split()[1]) * 1024 for line in file if line.startswith(name)), None)
+    except OSError:
+        return None
 
 
 def give_back_free_memory() -> None:
