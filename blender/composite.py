@@ -6,10 +6,12 @@ from typing import Any
 
 import bpy
 
-from .engine import IDNAME
+from .engine import IDNAME, MESHES, meshes_of
 from .errors import reported
 
 _SUFFIX = " splats"
+_LAYERS = "CompositorNodeRLayers"
+_USUAL = (_LAYERS, "CompositorNodeComposite")  # nodes of a new tree of Blender before 5
 _NEW = bpy.app.version >= (5, 0, 0)  # the compositor is a node group and shares nodes with shaders
 
 
@@ -19,25 +21,51 @@ def composite(scene: Any, engine: str) -> Any:
     The splats are rendered in a second scene with the same objects and camera. Each pixel shows the nearer of the two
     images over the farther one, by depth and alpha. If a pixel has splats before and behind a surface, their mean depth
     decides. Both films become transparent, so that edges are smooth. The world still lights the meshes but is not
-    visible. Another call makes the second scene anew, with objects that were added.
+    visible. Another call makes the second scene anew, with objects that were added. It keeps the nodes.
 
     Returns
     -------
     The second scene.
+
+    Raises
+    ------
+    InputError : `scene` is such a second scene, or Blender before 5 would lose its nodes.
     """
+    from clsplat.errors import InputError
+
+    if (meshes := meshes_of(scene)) is not None:
+        raise InputError(f"this is the scene of the splats: go to the scene {meshes.name} first")
     for layer in scene.view_layers:
         layer.use_pass_z = True
-    before = bpy.data.scenes.get(scene.name + _SUFFIX)
-    if before is not None:
-        bpy.data.scenes.remove(before)
+    before = next((other for other in bpy.data.scenes if meshes_of(other) == scene), None)
+    known = [] if before is None else [node for node in _layers_in_trees() if node.scene == before]
     splats = scene.copy()
-    splats.name = scene.name + _SUFFIX
+    splats[MESHES] = scene
     splats.render.engine = IDNAME
     splats.render.film_transparent = scene.render.film_transparent = True
     _use_nodes(splats, None)
     for layer in splats.view_layers:
         layer.use_pass_z = True
     scene.render.engine = engine
+    if known:
+        for node in known:
+            node.scene = splats
+    else:
+        _combine(scene, splats)
+    if before is not None:
+        bpy.data.scenes.remove(before)
+    splats.name = scene.name + _SUFFIX
+    return splats
+
+
+def _layers_in_trees() -> list[Any]:
+    """Return the nodes of all compositing trees that show a scene."""
+    trees = bpy.data.node_groups if _NEW else [scene.node_tree for scene in bpy.data.scenes if scene.node_tree]
+    return [node for tree in trees for node in tree.nodes if node.bl_idname == _LAYERS]
+
+
+def _combine(scene: Any, splats: Any) -> None:
+    """Make the nodes that combine the images of both scenes."""
     tree, sink = _tree(scene)
     of_splats, of_meshes = _layers(tree, splats, 0), _layers(tree, scene, -300)
     nearer = tree.nodes.new(_named("ShaderNodeMath", "CompositorNodeMath"))
@@ -61,7 +89,6 @@ def composite(scene: Any, engine: str) -> Any:
         (result, sink),
     ):
         tree.links.new(source, target)
-    return splats
 
 
 def _use_nodes(scene: Any, tree: Any) -> None:
@@ -73,15 +100,26 @@ def _use_nodes(scene: Any, tree: Any) -> None:
 
 
 def _tree(scene: Any) -> tuple[Any, Any]:
-    """Return an empty compositing tree of the scene, and the socket of its output image."""
+    """Return an empty compositing tree of the scene, and the socket of its output image.
+
+    The user's own tree stays in the file.
+    """
     if _NEW:
+        if scene.compositing_node_group is not None:
+            scene.compositing_node_group.use_fake_user = True
         tree = bpy.data.node_groups.new(f"{scene.name} clsplat", "CompositorNodeTree")
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
         scene.compositing_node_group = tree
         node = tree.nodes.new("NodeGroupOutput")
     else:
+        from clsplat.errors import InputError
+
         scene.use_nodes = True
         tree = scene.node_tree
+        if any(node.bl_idname not in _USUAL for node in tree.nodes):
+            raise InputError(
+                "the scene has compositing nodes, which would be lost: make a group of them elsewhere first"
+            )
         tree.nodes.clear()
         node = tree.nodes.new("CompositorNodeComposite")
     node.location = (900, 0)
@@ -89,7 +127,7 @@ def _tree(scene: Any) -> tuple[Any, Any]:
 
 
 def _layers(tree: Any, scene: Any, height: int) -> Any:
-    node = tree.nodes.new("CompositorNodeRLayers")
+    node = tree.nodes.new(_LAYERS)
     node.scene, node.location = scene, (0, height)
     return node
 

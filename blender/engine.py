@@ -14,8 +14,14 @@ if TYPE_CHECKING:
     from .pictures import Placed, Studio
 
 IDNAME = "CLSPLAT"
+MESHES = "clsplat_meshes"  # in the scene of splats of a composite: the scene of meshes
 _MOVING_SECONDS = 0.08  # time for a frame of the viewport while the view moves
 _studios: dict[str, Studio] = {}
+
+
+def meshes_of(scene: Any) -> Any:
+    """Return the scene of meshes, for a scene of splats that `composite` has made; None for other scenes."""
+    return scene.get(MESHES)
 
 
 def studio() -> Studio:
@@ -106,13 +112,15 @@ class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         for item in objects:
             placement(item)  # before the camera, which may be a child of a faulty object
         scene = depsgraph.scene
-        if scene.render.use_multiview:
+        # The scene of splats of a composite follows the camera and the frame of the scene of meshes.
+        first = meshes_of(scene) or scene
+        if first.render.use_multiview:
             raise InputError("stereoscopy is not rendered: turn it off, or render one camera after the other")
-        camera = self.camera_override or scene.camera
+        camera = first.camera if first != scene else self.camera_override or scene.camera
         if camera is None:
             raise InputError("the scene has no camera: add one, or make one active")
         evaluated = camera.evaluated_get(depsgraph)
-        raster = raster_of(scene.render, self.resolution_x, self.resolution_y)
+        raster = raster_of(first.render, self.resolution_x, self.resolution_y)
         pinhole = camera_of(lens_values(evaluated.data), raster, evaluated.matrix_world, camera.name)
         clip = (evaluated.data.clip_start, evaluated.data.clip_end)
         image = studio().render(objects, pinhole, clip)

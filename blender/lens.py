@@ -83,8 +83,9 @@ class Raster:
         """Left, bottom, right and top of the visible part, counted from below [px]."""
         if self.border is None:
             return 0, 0, self.width, self.height
-        left, bottom, right, top = self.border
-        return int(left * self.width), int(bottom * self.height), int(right * self.width), int(top * self.height)
+        sides = np.array(self.border, np.float32) * np.array([self.width, self.height] * 2, np.float32)
+        left, bottom, right, top = (int(side) for side in sides)  # in float32, as Blender rounds them
+        return left, bottom, right, top
 
 
 def camera_of(lens: Lens, raster: Raster, matrix_world: ArrayLike, name: str = "camera") -> Camera:
@@ -110,6 +111,8 @@ def camera_of(lens: Lens, raster: Raster, matrix_world: ArrayLike, name: str = "
     cx = raster.width / 2 - lens.shift_x * fitted
     cy = raster.height / 2 + lens.shift_y * fitted / aspect
     pose = np.array(matrix_world, np.float64)
+    if not np.linalg.det(pose[:3, :3]) > 0.0:
+        raise InputError(f"{name}: its transform is mirrored or flat; set its scale above 0")
     pose[:3, :3] /= np.maximum(np.linalg.norm(pose[:3, :3], axis=0), 1e-30)
     try:
         return Camera(raster.width, raster.height, fx, fx / aspect, cx, cy, cam_from_world_of(pose))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,6 +146,7 @@ def render(
         values["depth_range"],
         values["fps"],
     )
+    started = time.time()
     with ViewCount("rendering", quiet) as progress:
         try:
             rendered = render_views(
@@ -161,17 +163,22 @@ def render(
             )
         except KeyboardInterrupt:
             progress.clear()
-            if progress.total:
-                click.echo(_interrupted(output, progress), err=True)
+            if progress.total and (text := _interrupted(output, progress, started)):
+                click.echo(text, err=True)
             raise
     if not quiet:
         for line in _summary(output, rendered):
             click.echo(line)
 
 
-def _interrupted(output: RenderOutput, progress: ViewCount) -> str:
-    done = f"{progress.done} of {progress.total} frames were rendered"
-    return f"{output.video}: not written, as only {done}" if output.video else f"{output.folder}: {done}"
+def _interrupted(output: RenderOutput, progress: ViewCount, started: float) -> str | None:
+    """Return what an interruption left; None if the video was complete. started : time of the command's start [s]."""
+    if not output.video:
+        return f"{output.folder}: {progress.done} of {progress.total} frames were rendered"
+    video = Path(output.video)
+    if video.is_file() and video.stat().st_mtime >= started:
+        return None
+    return f"{video}: not written, as the command was stopped at frame {progress.done + 1} of {progress.total}"
 
 
 def _summary(output: RenderOutput, rendered: ModelRenders) -> list[str]:

@@ -50,6 +50,7 @@ class VideoWriter:
         require_encoder()
         self.frames = 0
         self._writer: Any = None
+        self._is_finished = False
         self._whole = contextlib.ExitStack()
 
     def __enter__(self) -> VideoWriter:
@@ -60,12 +61,23 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self._finish(complete=kind is None)
+            if not self._is_finished:
+                self._finish(complete=kind is None)
         except OutputError as failure:
             if kind is None:  # otherwise the first error is raised
                 self._whole.__exit__(OutputError, failure, failure.__traceback__)
                 raise
         self._whole.__exit__(kind, error, trace)
+
+    def finish(self) -> None:
+        """Complete the file under its temporary name, so that the end of the block has only to rename it.
+
+        Raises
+        ------
+        OutputError : frames are missing, or the encoder failed.
+        """
+        self._finish(complete=True)
+        self._is_finished = True
 
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Add a frame, (H, W, 3), of the first frame's size.

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 
+import io
 import numpy as np
 
 from ..errors import InputError
@@ -113,8 +114,10 @@ class ImageWriter:
         for ending, plane in planes.items():
             path = image_file(self.folder, stem, ending, self.format)
             if self.format == "npy":
-                with atomic_writer(path) as stream:
-                    np.save(stream, np.ascontiguousarray(plane, np.float32))
+                content = io.BytesIO()
+                np.save(content, np.ascontiguousarray(plane, np.float32))
+                with atomic_writer(path) as stream:  # np.save would hide why a disk takes no more
+                    stream.write(content.getbuffer())
             elif ending != "_depth":
                 write_png(path, plane, render=True)
             elif self.near_far is not None:
@@ -163,7 +166,12 @@ class VideoFiles:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._open.__exit__(kind, error, trace)
+        if kind is not None:
+            self._open.__exit__(kind, error, trace)
+            return
+        with self._open:  # no file appears before all of them are complete
+            for writer in self.writers.values():
+                writer.finish()
 
     def write(self, stem: str, image: Rendered) -> None:
         """Add the view to every video."""

@@ -182,3 +182,21 @@ def test_the_zip_takes_wheels(tmp_path: Path) -> None:
     assert [path.split("/")[-1].split("-")[0] for path in about["wheels"]] == ["clsplat", "pyopencl"]
     assert about["platforms"] == ["linux-x64"]
     assert "no such folder" in error_of("blender-addon", "--wheels", tmp_path / "none", "-o", tmp_path / "b.zip")
+
+
+def test_a_border_is_rounded_as_blender_does() -> None:
+    """Blender keeps shares as float32, in which 0.7 times 1920 is 1344. In double precision that is a little less."""
+    border = tuple(float(np.float32(share)) for share in (0.1, 0.1, 0.7, 0.9))
+    assert Raster(1920, 1080, border=border).pixels == (192, 108, 1344, 972)  # type: ignore[arg-type]
+    assert Raster(100, 60, border=(float(np.float32(0.29)), 0.0, float(np.float32(0.58)), 1.0)).pixels == (
+        29,
+        0,
+        58,
+        60,
+    )
+
+
+@pytest.mark.parametrize("scale", [(-1.0, 1.0, 1.0), (-1.0, -1.0, -1.0), (1.0, 0.0, 1.0)])
+def test_a_mirrored_camera_says_so(scale: tuple[float, float, float]) -> None:
+    with pytest.raises(InputError, match="view_0: its transform is mirrored or flat; set its scale above 0"):
+        camera_of(Lens(50.0, 36.0, 24.0, "AUTO", 0.0, 0.0), Raster(96, 64), np.diag([*scale, 1.0]), "view_0")

@@ -214,6 +214,20 @@ def test_meshes_and_splats_hide_each_other(blender: tuple[Path, dict[str, Any]])
     assert np.abs(got - plain)[:, half + 1 :][opaque[:, half + 1 :]].max() <= 6
 
 
+def test_a_composite_follows_what_changes_after_it(blender: tuple[Path, dict[str, Any]]) -> None:
+    """The frame is that of the scene of meshes. Another call keeps nodes and scenes of the user."""
+    _, facts = blender
+    fact = facts["composited_again"]
+    assert "failed" not in fact, fact
+    whole, part = picture(facts["composited"]["file"]), picture(fact["file"])
+    height, width = whole.shape[:2]
+    np.testing.assert_allclose(part, whole[: height - height // 2, width // 4 : width * 3 // 4], atol=1)
+    assert fact["kept"] == "Shot splats"
+    assert fact["nodes"]
+    assert fact["engines"] == ["CYCLES", "CLSPLAT"]
+    assert "this is the scene of the splats: go to the scene Shot first" in fact["told"]
+
+
 def test_the_viewport_shows_the_splats_coarsely_while_moving_then_in_full(blender: tuple[Path, dict[str, Any]]) -> None:
     """The engine draws into an offscreen buffer of Blender, as light in 16-bit reals."""
     folder, _ = blender

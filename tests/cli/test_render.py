@@ -274,7 +274,7 @@ def test_an_interrupted_video_says_so_and_leaves_nothing(
     result = run("render", model, "--path", "orbit", "--frames", "5", "--video", tmp_path / "v.mp4")
     assert result.exit_code == 130
     assert result.stderr.splitlines() == [
-        f"{tmp_path / 'v.mp4'}: not written, as only 2 of 5 frames were rendered",
+        f"{tmp_path / 'v.mp4'}: not written, as the command was stopped at frame 3 of 5",
         "error: interrupted",
     ]
     assert files(tmp_path) == set()

@@ -11,6 +11,8 @@ import pytest
 
 from clsplat.errors import InputError, OutputError
 from clsplat.files.video import VideoWriter
+from clsplat.rendering.outputs import EXTRAS, VideoFiles
+from clsplat.rendering.renderer import Rendered
 
 pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
 imageio = pytest.importorskip("imageio.v2")
@@ -130,6 +132,39 @@ def test_an_encoder_that_dies_is_one_line_and_leaves_nothing(tmp_path: Path, mon
         written()
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def rendered_views(number: int) -> Iterator[Rendered]:
+    color = np.linspace(0, 1, 24 * 32 * 3, dtype=np.float32).reshape(24, 32, 3)
+    for _ in range(number):
+        yield Rendered(color, color[..., 0], 2 * color[..., 0])
+
+
+def test_videos_appear_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A signal while an encoder finishes left the depth without its colours, which a second run refused to replace."""
+    finished: list[Path] = []
+    real = VideoWriter.finish
+
+    def finish(writer: VideoWriter) -> None:
+        if len(finished) == stop_after:
+            raise KeyboardInterrupt
+        real(writer)
+        finished.append(writer.path)
+        assert not list(tmp_path.glob("v*.mp4")), "none has its name yet"
+
+    monkeypatch.setattr(VideoWriter, "finish", finish)
+    for stop_after in (0, 1, 2):
+        finished.clear()
+        with pytest.raises(KeyboardInterrupt), VideoFiles(tmp_path / "v.mp4", 24, EXTRAS, (0.5, 3.0)) as videos:
+            for image in rendered_views(2):
+                videos.write("a", image)
+        assert not list(tmp_path.iterdir()), "nor is a temporary file left"
+    stop_after = 3
+    finished.clear()
+    with VideoFiles(tmp_path / "v.mp4", 24, EXTRAS, (0.5, 3.0)) as videos:
+        for image in rendered_views(2):
+            videos.write("a", image)
+    assert {path.name for path in tmp_path.iterdir()} == {"v.mp4", "v_alpha.mp4", "v_depth.mp4"}
 
 
 def test_a_missing_encoder_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

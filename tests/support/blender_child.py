@@ -240,6 +240,40 @@ def clipped() -> Facts:
 
 def composited() -> Facts:
     """Composite a plane through the middle of the splats that covers the left half of the image."""
+    with_plane()
+    told = reported(bpy.ops.clsplat.composite, engine="CYCLES")
+    return {"told": told, "file": rendered("composited"), "scenes": [each.name for each in bpy.data.scenes]}
+
+
+def composited_again() -> Facts:
+    """Composite, and change the frame, the name and the nodes afterwards. A scene of the user has the usual name."""
+    made, others = with_plane(), set(bpy.data.scenes)
+    bpy.ops.clsplat.composite(engine="CYCLES")
+    (first,) = set(bpy.data.scenes) - others
+    first.name = "other name"
+    made.name = "Shot"
+    mine = bpy.data.scenes.new("Shot splats")
+    tree = made.compositing_node_group if bpy.app.version >= (5, 0, 0) else made.node_tree
+    tree.nodes.new("CompositorNodeGlare").name = "Mine"
+    bpy.ops.clsplat.composite(engine="CYCLES")
+    (splats_scene,) = set(bpy.data.scenes) - others - {mine}
+    with bpy.context.temp_override(scene=splats_scene):
+        told = reported(bpy.ops.clsplat.composite, engine="CYCLES")
+    output = made.render
+    output.use_border = output.use_crop_to_border = True
+    output.border_min_x, output.border_max_x = 0.25, 0.75
+    output.border_min_y, output.border_max_y = 0.5, 1.0
+    return {
+        "file": rendered("composited_again"),
+        "told": told,
+        "kept": mine.name,
+        "nodes": "Mine" in tree.nodes,
+        "engines": [made.render.engine, splats_scene.render.engine],
+    }
+
+
+def with_plane() -> Any:
+    """Return a new scene with splats, and a plane through their middle that covers the left half of the image."""
     made = scene()
     splats(upright=False)
     camera = cameras()
@@ -263,8 +297,7 @@ def composited() -> Facts:
     emission.inputs["Color"].default_value = (0, 1, 0, 1)
     nodes.links.new(emission.outputs[0], output.inputs["Surface"])
     mesh.materials.append(material)
-    told = reported(bpy.ops.clsplat.composite, engine="CYCLES")
-    return {"told": told, "file": rendered("composited"), "scenes": [each.name for each in bpy.data.scenes]}
+    return made
 
 
 def gone() -> Facts:
@@ -325,7 +358,19 @@ def viewport() -> Facts:
     return {"drawn": (FOLDER / "viewport.npy").is_file()}
 
 
-CASES = (install, imported, frames, together, animation, projections, faults, clipped, composited, gone)
+CASES = (
+    install,
+    imported,
+    frames,
+    together,
+    animation,
+    projections,
+    faults,
+    clipped,
+    composited,
+    composited_again,
+    gone,
+)
 
 
 def main(cases: Sequence[Callable[[], Facts]], file: str) -> None:

@@ -98,6 +98,8 @@ def _replaced_chunks(path: Path) -> Iterator[Path]:
             shutil.rmtree(path.parent / name)
         for folder in sorted(unfinished.iterdir()):
             move(folder, path.parent / folder.name)
+    except OutputError as error:
+        raise OutputError(str(error).replace(f"{unfinished.name}{os.sep}", "")) from None
     except OSError as error:
         raise OutputError(
             f"{path}: its chunks cannot be written ({error.strerror or error}); choose another place"
