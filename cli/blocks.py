@@ -117,7 +117,7 @@ def run_blocks(
 
 def warn_of_single_model(config: TrainConfig, flag: str) -> None:
     """Warn about options that write or measure models before the last one. Trainings with `flag` ignore them."""
-    for name in ("save_iterations", "test_iterations"):
+    for name in ("save_iterations", "test_iterations", "validate"):
         if config.named_options.get(name):
             warnings.warn(f"--{name.replace('_', '-')} has no effect with {flag}", stacklevel=2)
 

@@ -197,8 +197,8 @@ def train(
     reconstructed first, into MODEL/scene (see clsplat reconstruct).
 
     The model's folder gets config.json, cameras.json, log.jsonl, checkpoint.npz and
-    point_cloud/iteration_N/point_cloud.ply. With --budget auto, the folder also gets budget.json and a chart of the
-    rounds; the small model is the last point cloud.
+    point_cloud/iteration_N/point_cloud.ply. With --budget auto, it gets budget.json and a chart of the rounds in place
+    of the checkpoint; the small model is the last point cloud.
     """
     from clsplat.scenes.changed_photos import check_photos
     from clsplat.scenes.reconstruct.photo_files import is_photographs

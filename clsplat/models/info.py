@@ -12,7 +12,7 @@ from ..scenes.info import SceneInfo, is_scene, scene_info
 from ..scenes.reconstruct.photo_files import is_photographs
 from ..scenes.scene_files import OTHER_KINDS
 from ..scenes.wrong_folder import describe_file, scene_hint
-from ..splats.formats.any_file import READ_ENDINGS, READ_NAMES, stored_bytes
+from ..splats.formats.any_file import ELSEWHERE, READ_ENDINGS, READ_NAMES, stored_bytes
 from ..splats.stats import Complexity, complexity
 from ..training.folder import ModelFolder
 from .model import LoadedModel, load_model
@@ -67,6 +67,8 @@ def inspect(
 
 
 def _is_scene(path: Path) -> bool:
+    if path.suffix.lower() in ELSEWHERE:
+        return False  # load_model says what to do with them
     if path.is_file() and not is_scene(path) and not path.name.lower().endswith(READ_ENDINGS):
         raise InputError(f"{path}: {describe_file(path)}")
     if path.is_file() or not path.is_dir() or ModelFolder(path).iterations():

@@ -146,7 +146,7 @@ def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCame
     source, view_set = model.path, choice.view_set
     if choice.cameras is not None:
         views, source, view_set = read_cameras(choice.cameras), Path(choice.cameras), view_set or "all"
-    elif choice.scene:
+    elif choice.scene or _needs_scene(model, view_set):
         scene = model.load_scene(choice.scene, check=False)
         views = named_cameras(scene.names, scene.cameras)
         held_out, source = _HeldOut(scene.test_names, scene.validation_names), scene.path
@@ -160,6 +160,13 @@ def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCame
     if choice.size is not None:
         views = [NamedCamera(view.name, resized_by_height(view.camera, *choice.size)) for view in views]
     return views, None
+
+
+def _needs_scene(model: LoadedModel, view_set: str | None) -> bool:
+    """Return whether the views are in the scene alone that the model records: 3DGS's models name no test views."""
+    if model.folder is None or model.test_names is not None or not model.scene_record.get("path"):
+        return False
+    return view_set in ("test", "train") or not model.folder.cameras_path.is_file()
 
 
 def _check_memory(views: Sequence[NamedCamera]) -> None:

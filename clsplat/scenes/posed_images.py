@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files.image_names import IMAGE_SUFFIXES
-from ..files.images import image_size
+from ..files.images import image_size, is_render
 from .colmap import Points, find_model, read_model
 from .colmap_folder import PHOTOS, colmap_folder
 from .options import ORIGIN
@@ -110,7 +110,7 @@ def _place_of(root: Path, files: Sequence[Path]) -> str:
     for folder, way in ((home, ""), (home.absolute().parent, "../")):
         with suppress(OSError):  # the folder above may be closed to this user
             for place in sorted(folder.iterdir()):
-                if place.is_dir() and (place / missing).is_file():
+                if (place / missing).is_file() and not is_render(place / missing):
                     return f", such as {way}{place.name}"
     return ""
 

@@ -34,7 +34,7 @@ SEARCH = (
 def found(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Folder of a model from a search, and the command's output, with its warnings."""
     folder = tmp_path_factory.mktemp("search") / "model"
-    search = ("--budget", "auto", "--budget-tolerance", "1dB", "--save-iterations", "5", *SEARCH)
+    search = ("--budget", "auto", "--budget-tolerance", "1dB", "--save-iterations", "5", "--validate", *SEARCH)
     result = run("train", scene, "-m", folder, *search)
     assert result.exit_code == 0, result.output
     return folder, result.output
@@ -128,6 +128,7 @@ def test_prune_refuses(model: Path, tmp_path: Path) -> None:
 def test_a_search_writes_a_smaller_model(found: tuple[Path, str]) -> None:
     folder, output = found
     assert "warning: --save-iterations has no effect with --budget" in output
+    assert "warning: --validate has no effect with --budget" in output
     report = json.loads((folder / "budget.json").read_text())
     assert report["options"]["tolerance"] == 1
     last = ModelFolder(folder).latest_ply()[0]

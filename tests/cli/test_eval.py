@@ -246,6 +246,20 @@ def test_a_folder_of_3dgs_knows_its_scene(copied_model: Path, scene: Path, tmp_p
     assert white["background"] == [1, 1, 1]
 
 
+@pytest.mark.parametrize("with_cameras", [True, False])
+def test_the_test_views_of_a_folder_of_3dgs_are_rendered(
+    copied_model: Path, scene: Path, tmp_path: Path, with_cameras: bool
+) -> None:
+    """3DGS's cameras.json does not say which views are test views: the scene does, which cfg_args names."""
+    as_3dgs(copied_model, namespace(scene))
+    if not with_cameras:
+        (copied_model / "cameras.json").unlink()
+    clsplat("render", copied_model, "-o", tmp_path / "test", "--set", "test", "-q")
+    assert sorted(file.stem for file in (tmp_path / "test").iterdir()) == sorted(Path(name).stem for name in TEST_NAMES)
+    clsplat("render", copied_model, "-o", tmp_path / "all", "--set", "all", "-q")
+    assert len(list((tmp_path / "all").iterdir())) == len(load_scene(scene).views)
+
+
 def test_3dgs_without_eval_has_no_test_views(copied_model: Path, scene: Path, tmp_path: Path) -> None:
     as_3dgs(copied_model, namespace(scene, eval=False))
     assert "was trained on all views" in error_of("eval", copied_model)

@@ -14,6 +14,7 @@ import pytest
 from small_scene import CX, CY, FX, FY, HEIGHT, WIDTH, model_views, write_garden
 
 from clsplat.errors import InputError
+from clsplat.files.images import write_png
 from clsplat.scenes.scene import Scene, load_scene
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -80,6 +81,15 @@ def test_photos_in_another_folder_are_named(folder: Path, place: str, named: str
     with pytest.raises(InputError, match=rf"or name another folder of photos, such as {re.escape(named)} \("):
         load(folder, LENS | {"frames": frames("{}")})
     assert len(load_scene(folder, images=named).views) == len(model_views())
+
+
+def test_a_folder_of_renders_is_not_named_for_photos(folder: Path) -> None:
+    """Training on them would learn the faults of the model that rendered them."""
+    (folder / "images").rename(folder.parent / "kept")
+    for view in model_views():
+        write_png(folder.parent / "aa_renders" / view.name, np.zeros((30, 40, 3), np.uint8), render=True)
+    with pytest.raises(InputError, match=r"or name another folder of photos, such as ../kept \("):
+        load(folder, LENS | {"frames": frames("{}")})
 
 
 def test_axes_of_opencv(folder: Path) -> None:

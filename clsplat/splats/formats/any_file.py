@@ -33,7 +33,7 @@ PLY_ENDING, SPLAT_ENDING, SPZ_ENDING, SOG_ENDING = ".ply", ".splat", ".spz", ".s
 
 _PLY_STARTS = (b"ply\n", b"ply\r")
 _PAGE_START = b"<!DOCTYP"
-_ELSEWHERE = (".ksplat", ".lcc", ".lcc2")  # formats that splat-transform of PlayCanvas reads
+ELSEWHERE = (".ksplat", ".lcc", ".lcc2")  # formats that splat-transform of PlayCanvas reads
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix in _ELSEWHERE:
+    if suffix in ELSEWHERE:
         raise InputError(
             f"{path}: {suffix} files are not read: convert it with `splat-transform {path.name} {path.stem}.ply` "
             "(npm install @playcanvas/splat-transform)"

@@ -12,6 +12,7 @@ import pytest
 from reference.scenes import random_splats
 
 from clsplat.errors import InputError, OutputError
+from clsplat.models.info import inspect
 from clsplat.splats.splats import Splats
 
 
@@ -67,6 +68,8 @@ def test_formats_that_are_not_read_have_a_way(tmp_path: Path, name: str) -> None
     (tmp_path / name).write_bytes(b"1234")
     with pytest.raises(InputError, match=rf"{name}: .* `splat-transform {name} room.ply`"):
         Splats.load(tmp_path / name)
+    with pytest.raises(InputError, match=rf"{name}: .* `splat-transform {name} room.ply`"):
+        inspect(tmp_path / name)
 
 
 def test_what_is_no_file_of_splats_is_refused(tmp_path: Path) -> None:
