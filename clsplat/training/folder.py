@@ -156,7 +156,10 @@ class ModelFolder:
     def check_space(self, nbytes: int) -> None:
         """Raise OutputError if the disk has less room than `nbytes`, also without an earlier model in the folder."""
         replaced = [self.checkpoint_path, *(self.ply_path(iteration) for iteration in self.iterations())]
-        disk = shutil.disk_usage(self.path)
+        try:
+            disk = shutil.disk_usage(self.path)
+        except (AttributeError, OSError):  # some systems do not say
+            return
         free = disk.free + sum(path.stat().st_size for path in replaced if path.is_file())
         if disk.total and free < nbytes:  # some network disks have no size
             raise OutputError(
