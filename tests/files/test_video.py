@@ -143,27 +143,28 @@ def rendered_views(number: int) -> Iterator[Rendered]:
 def test_videos_appear_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A signal while an encoder finishes left the depth without its colours, which a second run refused to replace."""
     finished: list[Path] = []
-    real = VideoWriter.finish
+    real, interrupted_at = VideoWriter.finish, [0]
 
     def finish(writer: VideoWriter) -> None:
-        if len(finished) == stop_after:
+        if len(finished) == interrupted_at[0]:
             raise KeyboardInterrupt
         real(writer)
         finished.append(writer.path)
         assert not list(tmp_path.glob("v*.mp4")), "none has its name yet"
 
-    monkeypatch.setattr(VideoWriter, "finish", finish)
-    for stop_after in (0, 1, 2):
+    def write() -> None:
         finished.clear()
-        with pytest.raises(KeyboardInterrupt), VideoFiles(tmp_path / "v.mp4", 24, EXTRAS, (0.5, 3.0)) as videos:
+        with VideoFiles(tmp_path / "v.mp4", 24, EXTRAS, (0.5, 3.0)) as videos:
             for image in rendered_views(2):
                 videos.write("a", image)
+
+    monkeypatch.setattr(VideoWriter, "finish", finish)
+    for interrupted_at[0] in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            write()
         assert not list(tmp_path.iterdir()), "nor is a temporary file left"
-    stop_after = 3
-    finished.clear()
-    with VideoFiles(tmp_path / "v.mp4", 24, EXTRAS, (0.5, 3.0)) as videos:
-        for image in rendered_views(2):
-            videos.write("a", image)
+    interrupted_at[0] = 3
+    write()
     assert {path.name for path in tmp_path.iterdir()} == {"v.mp4", "v_alpha.mp4", "v_depth.mp4"}
 
 
