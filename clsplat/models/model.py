@@ -122,7 +122,7 @@ class LoadedModel:
         if choice.path is None:
             path = existing_scene(path, self.path)
         # A file of splats records nothing. Splats far away have the coordinates of the scene's files.
-        is_known = "origin" in record or is_far(self.splats.mean, self.splats.log_scale)
+        is_known = "origin" in record or is_far(self.splats.mean)
         origin = self.origin if is_known else None
         test_names = self.test_names
         if test_names is not None and (choice.test_every or choice.test_list):

@@ -20,7 +20,7 @@ from .posed_images import PosedImages
 
 # Largest distance from the origin in units of the scene's size. Beyond it, training in float32 loses image quality.
 FAR = 1e4
-# In a long scene details are small for its size. The step of float32 there may be this part of a pixel, or of a splat.
+# In a long scene details are small for its size. The step of float32 there may be this part of a pixel.
 _STEP_SHARE = 0.5
 _LONG = FAR / 100.0  # scenes nearer to the origin, in units of their size, are no case for this rule
 _NEAREST = 0.1  # part of the points in an image that are nearer than its details
@@ -81,19 +81,13 @@ def camera_centres(posed: PosedImages) -> NDArray[np.float64]:
     return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
-def is_far(xyz: Array, log_scale: Array) -> bool:
-    """Return whether splats are further from the origin than scenes may be.
+def is_far(xyz: Array) -> bool:
+    """Return whether splats, (N, 3), have the coordinates of a scene that was not moved, although it might be.
 
-    Parameters
-    ----------
-    xyz : (N, 3) their positions. log_scale : (N, 3) logarithms of their standard deviations.
+    The origin of a moved scene is inside of it, so that its splats are near.
     """
     wide = xyz.astype(np.float64)
-    if not len(wide):
-        return False
-    centre = np.median(wide, axis=0)
-    ratio = _ratio(centre, _spread(wide) or 1.0)
-    return ratio >= FAR or (ratio >= _LONG and _is_coarse(centre, float(np.exp(np.median(log_scale.max(axis=1))))))
+    return len(wide) > 0 and _ratio(np.median(wide, axis=0), _spread(wide) or 1.0) >= _LONG
 
 
 def size_of(posed: PosedImages) -> float:
