@@ -35,10 +35,12 @@ def composite(scene: Any, engine: str) -> Any:
 
     if (meshes := meshes_of(scene)) is not None:
         raise InputError(f"this is the scene of the splats: go to the scene {meshes.name} first")
-    for layer in scene.view_layers:
-        layer.use_pass_z = True
     before = next((other for other in bpy.data.scenes if meshes_of(other) == scene), None)
     known = [] if before is None else [node for node in _layers_in_trees() if node.scene == before]
+    if not (_NEW or known) and any(node.bl_idname not in _USUAL for node in _nodes(scene)):
+        raise InputError("the scene has compositing nodes, which would be lost: make a group of them elsewhere first")
+    for layer in scene.view_layers:
+        layer.use_pass_z = True
     splats = scene.copy()
     splats[MESHES] = scene
     splats.render.engine = IDNAME
@@ -60,8 +62,16 @@ def composite(scene: Any, engine: str) -> Any:
 
 def _layers_in_trees() -> list[Any]:
     """Return the nodes of all compositing trees that show a scene."""
-    trees = bpy.data.node_groups if _NEW else [scene.node_tree for scene in bpy.data.scenes if scene.node_tree]
-    return [node for tree in trees for node in tree.nodes if node.bl_idname == _LAYERS]
+    if _NEW:
+        nodes = [node for tree in bpy.data.node_groups for node in tree.nodes]
+    else:
+        nodes = [node for scene in bpy.data.scenes for node in _nodes(scene)]
+    return [node for node in nodes if node.bl_idname == _LAYERS]
+
+
+def _nodes(scene: Any) -> list[Any]:
+    """Return the compositing nodes of a scene of Blender before 5."""
+    return list(scene.node_tree.nodes) if scene.node_tree else []
 
 
 def _combine(scene: Any, splats: Any) -> None:
@@ -112,14 +122,8 @@ def _tree(scene: Any) -> tuple[Any, Any]:
         scene.compositing_node_group = tree
         node = tree.nodes.new("NodeGroupOutput")
     else:
-        from clsplat.errors import InputError
-
         scene.use_nodes = True
         tree = scene.node_tree
-        if any(node.bl_idname not in _USUAL for node in tree.nodes):
-            raise InputError(
-                "the scene has compositing nodes, which would be lost: make a group of them elsewhere first"
-            )
         tree.nodes.clear()
         node = tree.nodes.new("CompositorNodeComposite")
     node.location = (900, 0)
