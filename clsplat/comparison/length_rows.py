@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .sweep_rows import ChartRow, chart_point, is_auto, with_front
+from .sweep_rows import ChartRow, chart_point, with_front
 from .table import Record, scene_title, summarise
 
 
@@ -21,9 +21,7 @@ def length_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "seconds", "psnr" [dB] and "ssim". "front":
     whether the point is on the Pareto front of seconds and PSNR in its scene.
     """
-    done = [
-        row for row in summarise(with_shared_seeds(records)) if row["psnr"] is not None and not is_auto(row["system"])
-    ]
+    done = [row for row in summarise(with_shared_seeds(records)) if row["psnr"] is not None]
     rows: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in done):
         lengths: dict[tuple[int, str], set[int]] = {}

@@ -22,14 +22,13 @@ from .sweep_charts import equal_chart, length_chart, size_chart, time_chart
 from .sweep_rows import (
     ChartRow,
     arithmetic_rows,
-    auto_rows,
     curve_rows,
     equal_rows,
     point_rows,
     seed_rows,
     write_rows,
 )
-from .sweep_tables import NONE, TextTable, arithmetic_table, auto_table, equal_table, equal_time_table, seed_table
+from .sweep_tables import NONE, TextTable, arithmetic_table, equal_table, equal_time_table, seed_table
 from .table import HEAD, Record, cells, notes, summarise
 
 CHARTS, REPORT = "charts", "report.html"
@@ -51,9 +50,8 @@ _TEXT = {
         "Quality against render time, bytes and splats",
         "Each point is a training run, or the mean over its seeds. All have the most frequent length, or the longest "
         "if several are as frequent. Grey: the Pareto front; no point is both better and cheaper than a point of the "
-        "front. Its points are labelled by the cap on splats. A star chose its number "
-        "of splats itself. Render time is the median over the test views of the fastest of five renders, on the "
-        "host's clock; the protocol names the exceptions.",
+        "front. Its points are labelled by the cap on splats. Render time is the median over the test views of the "
+        "fastest of five renders, on the host's clock; the protocol names the exceptions.",
     ),
     "equal": (
         "Splats needed at equal quality",
@@ -159,11 +157,11 @@ def write_report(
         raise InputError(f"{folder}: no runs to draw")
     folder, kept = Path(folder), distinct(records)
     points, lengths, seeds = point_rows(kept), length_rows(kept), seed_rows(kept)
-    first = reference or next((point["system"] for point in points if not point["auto"]), "")
-    equal, auto, forms = equal_rows(points, first), auto_rows(points), arithmetic_rows(arithmetic)
+    first = reference or next((point["system"] for point in points), "")
+    equal, forms = equal_rows(points, first), arithmetic_rows(arithmetic)
     parts: list[tuple[str, Sequence[ChartRow], Callable[[Any, Path], list[Path]], TextTable]] = [
         ("length", lengths, length_chart, equal_time_table(equal_time_rows(lengths, first), first)),
-        ("size", points, size_chart, auto_table(auto)),
+        ("size", points, size_chart, NONE),
         ("equal", equal, lambda rows, out: equal_chart(rows, first, out), equal_table(equal, first)),
         ("time", curve_rows(kept), time_chart, NONE),
         ("seeds", seeds, seeds_chart, seed_table(seeds)),

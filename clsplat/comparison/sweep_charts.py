@@ -20,7 +20,6 @@ from ..evaluation.chart_style import (
     place_labels,
     shape_colour,
     short_count,
-    star,
     system_legend,
 )
 from .sweep_rows import ChartRow
@@ -91,38 +90,29 @@ def size_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
     """Draw test PSNR against render time, file size and splats; a row for each scene.
 
     The Pareto front is grey, and its points are labelled by their caps. Points of a method at several caps are joined.
-    Stars are runs that chose their number of splats themselves.
 
     Parameters
     ----------
     rows : of `sweep_rows.point_rows`. out : path without a suffix. Raises as `time_chart`.
     """
-    scenes = _scenes(rows, out)
-    swept = [row for row in rows if not row["auto"]]
-    stars = {row["system"]: row["shape"] for row in rows if row["auto"]}
-    styles = looks({row["system"]: row["shape"] for row in swept})
-    with drawing(out, WIDTH, 2.9 * len(scenes) + 0.3 + 0.2 * legend_rows(len(styles) + len(stars))) as figure:
+    scenes, styles = _scenes(rows, out), looks({row["system"]: row["shape"] for row in rows})
+    with drawing(out, WIDTH, 2.9 * len(scenes) + 0.3 + 0.2 * legend_rows(len(styles))) as figure:
         panels = figure.subplots(len(scenes), len(_COSTS), squeeze=False, sharey="row")
         labels: list[tuple[Any, list[Label]]] = []
         for line, scene in enumerate(scenes):
             shown = [row for row in rows if row["scene"] == scene]
             for axes, (cost, (name, unit)) in zip(panels[line], _COSTS.items(), strict=True):
                 _cost_panel(axes, [row for row in shown if row[cost] is not None], cost, unit, styles)
-                front = sorted((row for row in shown if row[f"front_{cost}"]), key=lambda row: not row["auto"])
-                names = ["auto" if row["auto"] else short_count(row["cap"]) for row in front]
-                labels.append(
-                    (
-                        axes,
-                        [
-                            (unit * row[cost], row["psnr"], name, shape_colour(row["shape"]))
-                            for name, row in zip(names, front, strict=True)
-                        ],
-                    )
-                )
+                front = [
+                    (unit * row[cost], row["psnr"], short_count(row["cap"]), shape_colour(row["shape"]))
+                    for row in shown
+                    if row[f"front_{cost}"]
+                ]
+                labels.append((axes, front))
                 if line == len(scenes) - 1:
                     axes.set_xlabel(name)
             panels[line][0].set_ylabel(f"{scene}\ntest PSNR [dB]")
-        system_legend(figure, styles, stars)
+        system_legend(figure, styles)
         place_labels(figure, labels)
     return chart_paths(out)
 
@@ -203,14 +193,9 @@ def _cost_panel(
     front = sorted((unit * row[cost], row["psnr"]) for row in shown if row[f"front_{cost}"])
     axes.plot(*zip(*front, strict=True), color=FRONT, linewidth=3.5, drawstyle="steps-post", zorder=1)
     for system, style in styles.items():
-        line = sorted(
-            (row["cap"], unit * row[cost], row["psnr"]) for row in shown if row["system"] == system and not row["auto"]
-        )
+        line = sorted((row["cap"], unit * row[cost], row["psnr"]) for row in shown if row["system"] == system)
         if line:
             axes.plot([point[1] for point in line], [point[2] for point in line], **style)
-    for row in shown:
-        if row["auto"]:
-            axes.plot([unit * row[cost]], [row["psnr"]], **star(row["shape"]))
     costs = [unit * row[cost] for row in shown]
     low, high = min(costs) / 1.2, max(costs) * 1.2
     axes.set(xscale="log", xlim=(low, high))

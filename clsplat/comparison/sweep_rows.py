@@ -21,7 +21,6 @@ from .table import Record, scene_title, summarise
 ChartRow = dict[str, Any]
 
 COSTS = ("render_ms", "bytes", "splats")  # the horizontal axes
-AUTO = "auto"  # first word of the system of a run that chose its number of splats
 MIN_SEEDS = 3  # for a spread
 
 
@@ -55,40 +54,36 @@ def curve_rows(records: Sequence[Record]) -> list[ChartRow]:
 def point_rows(records: Sequence[Record]) -> list[ChartRow]:
     """Return a point for each system and cap, as means over the seeds; scenes with a single cap are left out.
 
-    Points have the most frequent iterations of their scene, of equally frequent ones the largest; automatic runs may
-    have any.
+    Points have the most frequent iterations of their scene, of equally frequent ones the largest.
 
     Returns
     -------
-    "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "auto", "psnr" [dB], "ssim", "seconds",
+    "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "psnr" [dB], "ssim", "seconds",
     "parameters" and COSTS; a cost that no run measured is None. "front_C" for each cost C: whether the point is on the
     Pareto front of its scene.
     """
     measured = ("psnr", "ssim", "seconds", "parameters", *COSTS)
-    rows = [
-        chart_point(row, measured, auto=is_auto(row["system"])) for row in summarise(records) if row["psnr"] is not None
-    ]
+    rows = [chart_point(row, measured) for row in summarise(records) if row["psnr"] is not None]
     kept: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         group = [row for row in rows if row["scene"] == scene]
-        swept = [row for row in group if not row["auto"]]
-        if len({row["cap"] for row in swept}) < 2:
+        if len({row["cap"] for row in group}) < 2:
             continue
-        known = Counter(row["iterations"] for row in swept)
+        known = Counter(row["iterations"] for row in group)
         usual = max(known, key=lambda iterations: (known[iterations], iterations))
-        group = [row for row in group if row["auto"] or row["iterations"] == usual]
+        group = [row for row in group if row["iterations"] == usual]
         for cost in COSTS:
             group = with_front(group, cost, f"front_{cost}")
         kept += group
     return kept
 
 
-def chart_point(row: Record, measured: Sequence[str], **more: Any) -> ChartRow:
+def chart_point(row: Record, measured: Sequence[str]) -> ChartRow:
     """Return a row of `table.summarise` as a point of a chart.
 
     Returns
     -------
-    "scene", "system", "shape", "cap", "iterations", "seeds" (the number of those that did not fail), `more`, and the
+    "scene", "system", "shape", "cap", "iterations", "seeds" (the number of those that did not fail), and the
     mean of each value measured; None if no run measured it.
     """
     return {
@@ -98,7 +93,6 @@ def chart_point(row: Record, measured: Sequence[str], **more: Any) -> ChartRow:
         "cap": row["cap"],
         "iterations": row["iterations"],
         "seeds": len(row["seeds"]) - len(row["failed"]),
-        **more,
         **{key: None if row[key] is None else row[key]["mean"] for key in measured},
     }
 
@@ -110,11 +104,6 @@ def with_front(points: Sequence[ChartRow], cost: str, name: str) -> list[ChartRo
     """
     best = pareto([(math.inf if point[cost] is None else point[cost], point["psnr"]) for point in points])
     return [point | {name: place in best and point[cost] is not None} for place, point in enumerate(points)]
-
-
-def is_auto(system: str) -> bool:
-    """Return whether the label of a system means that the run chose its number of splats itself."""
-    return system.split(" ")[0].split(":")[0] == AUTO
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
@@ -148,7 +137,7 @@ def equal_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
     for scene in dict.fromkeys(point["scene"] for point in points):
         curves: dict[str, list[ChartRow]] = {}
         for point in points:
-            if point["scene"] == scene and not point["auto"]:
+            if point["scene"] == scene:
                 curves.setdefault(point["system"], []).append(point)
         for system, group in curves.items():
             if system == reference or len(group) < 2:
@@ -170,39 +159,6 @@ def equal_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
                         "bound": "at most" if smallest else "",
                     }
                 )
-    return rows
-
-
-def auto_rows(points: Sequence[ChartRow]) -> list[ChartRow]:
-    """Return the runs that chose their number of splats, beside the best run of the sweep with their shape.
-
-    Returns
-    -------
-    For each "auto" of `point_rows`: "scene", "system", "shape", "psnr" [dB], "splats", "bytes", "best_cap" and
-    "best_psnr". "lost" is the PSNR below the best [dB]. "splats_ratio" and "bytes_ratio" are relative to the best. All
-    values of the best are None if the sweep does not have the shape. "front" names the costs on whose Pareto front the
-    run lies.
-    """
-    rows: list[ChartRow] = []
-    for auto in points:
-        if auto["auto"]:
-            swept = [
-                point
-                for point in points
-                if not point["auto"] and point["scene"] == auto["scene"] and point["shape"] == auto["shape"]
-            ]
-            best = max(swept, key=lambda point: float(point["psnr"]), default=None)
-            rows.append(
-                {key: auto[key] for key in ("scene", "system", "shape", "psnr", "splats", "bytes")}
-                | {
-                    "best_cap": best and best["cap"],
-                    "best_psnr": best and best["psnr"],
-                    "lost": best and best["psnr"] - auto["psnr"],
-                    "splats_ratio": best and auto["splats"] / best["splats"],
-                    "bytes_ratio": best and auto["bytes"] / best["bytes"],
-                    "front": " ".join(cost for cost in COSTS if auto[f"front_{cost}"]),
-                }
-            )
     return rows
 
 
@@ -269,7 +225,7 @@ def seed_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "cap", "iterations", "system", "shape", "seed", "repeat", "psnr" [dB], "ssim", "digest". Each scene has the
     cap and the iterations with the largest number of such systems.
     """
-    done = [record for record in records if not record["failed"] and not is_auto(record["system"])]
+    done = [record for record in records if not record["failed"]]
     seeds: dict[tuple[Any, ...], set[int]] = {}
     for record in done:
         seeds.setdefault(_setting(record), set()).add(record["config"]["seed"])

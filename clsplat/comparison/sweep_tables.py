@@ -41,48 +41,6 @@ def equal_time_table(rows: Sequence[ChartRow], reference: str) -> TextTable:
     return ("scene", "system", *(f"{reference}, {length} iterations" for length in lengths)) if rows else (), lines
 
 
-def auto_table(rows: Sequence[ChartRow]) -> TextTable:
-    """Return automatic runs beside the best run of the sweep. rows : of `sweep_rows.auto_rows`."""
-    head = (
-        "scene",
-        "system",
-        "PSNR",
-        "splats",
-        "MB",
-        "best cap",
-        "its PSNR",
-        "lost dB",
-        "% of its splats",
-        "% of its MB",
-        "on the front of",
-    )
-    lines: list[tuple[str, ...]] = []
-    for row in rows:
-        best = (
-            ("",) * 5
-            if row["best_cap"] is None
-            else (
-                str(row["best_cap"]),
-                f"{row['best_psnr']:.2f}",
-                f"{row['lost']:.2f}",
-                f"{100 * row['splats_ratio']:.0f}",
-                f"{100 * row['bytes_ratio']:.0f}",
-            )
-        )
-        lines.append(
-            (
-                row["scene"],
-                row["system"],
-                f"{row['psnr']:.2f}",
-                f"{row['splats']:.0f}",
-                f"{1e-6 * row['bytes']:.2f}",
-                *best,
-                row["front"] or "none",
-            )
-        )
-    return head, lines
-
-
 def seed_table(rows: Sequence[ChartRow]) -> TextTable:
     """Return the PSNR over seeds, and over repeats of one seed. rows : of `sweep_rows.seed_rows`."""
     head = (

@@ -204,31 +204,11 @@ def tile(corner: tuple[float, float], fill: str, label: str | None = None) -> An
     return Rectangle(corner, 1, 1, facecolor=fill, edgecolor=FAINT if label else "white", linewidth=1.2, label=label)
 
 
-def star(shape: str) -> dict[str, Any]:
-    """Keywords of `Axes.plot` for the point of a run that chose its own number of splats."""
-    return {
-        "marker": "*",
-        "markersize": 14,
-        "color": shape_colour(shape),
-        "markeredgecolor": INK,
-        "markeredgewidth": 0.9,
-        "linestyle": "none",
-        "zorder": 5,
-    }
-
-
-def system_legend(figure: Any, styles: dict[str, dict[str, Any]], stars: dict[str, str] | None = None) -> None:
-    """Draw a legend of all methods below the panels.
-
-    Parameters
-    ----------
-    styles : what `looks` returned.
-    stars : shapes of the methods that are drawn as stars, by label.
-    """
+def system_legend(figure: Any, styles: dict[str, dict[str, Any]]) -> None:
+    """Draw a legend of all methods below the panels. styles : what `looks` returned."""
     from matplotlib.lines import Line2D
 
-    lines = styles | {label: star(shape) | {"markersize": 11} for label, shape in (stars or {}).items()}
-    handles = [Line2D([], [], label=label, **style) for label, style in lines.items()]
+    handles = [Line2D([], [], label=label, **style) for label, style in styles.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), _LEGEND_COLUMNS), handlelength=3)
 
 

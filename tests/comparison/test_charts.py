@@ -86,15 +86,15 @@ def test_size_chart(tmp_path: Path, drawn: list[Any]) -> None:
     size_chart(rows, tmp_path / "size")
     render, size, splats = drawn[0].axes
     assert [axes.get_xlabel() for axes in (render, size, splats)] == ["render time [ms]", "file [MB]", "splats"]
-    assert legend_of(drawn[0]) == ["gaussian", "default", "auto default"]
-    front, gaussian, default, star = splats.lines
+    assert legend_of(drawn[0]) == ["gaussian", "default", "half-gaussian"]
+    front, gaussian, default, single = splats.lines
     assert list(front.get_xdata()) == [1000, 1500, 4000]
     assert front.get_drawstyle() == "steps-post"
     assert (list(gaussian.get_xdata()), list(gaussian.get_ydata())) == ([1000, 2000, 4000], [20, 21, 22])
-    assert (star.get_marker(), star.get_color()) == ("*", default.get_color())
+    assert list(single.get_xdata()) == [1500]
     assert gaussian.get_color() == shape_colour("gaussian") != default.get_color()
     assert list(size.lines[1].get_xdata()) == pytest.approx([0.2, 0.4, 0.8])
-    assert set(words(splats)) == {"auto", "1k", "4k"}, "the front is labelled, all else is not"
+    assert set(words(splats)) == {"1k", "1.5k", "4k"}, "the front is labelled, all else is not"
 
 
 def test_time_chart(tmp_path: Path, drawn: list[Any]) -> None:

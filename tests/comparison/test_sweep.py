@@ -16,17 +16,15 @@ from clsplat.comparison.methods import parse_methods
 from clsplat.comparison.runs import RunFile, read_runs
 from clsplat.comparison.sweep import sweep, write_report
 from clsplat.comparison.sweep_rows import (
-    auto_rows,
     curve_rows,
     equal_rows,
-    is_auto,
     pareto,
     point_rows,
     seed_rows,
     splats_needed,
     write_rows,
 )
-from clsplat.comparison.sweep_tables import auto_table, equal_table, equal_time_table, seed_table
+from clsplat.comparison.sweep_tables import equal_table, equal_time_table, seed_table
 from clsplat.comparison.table import Record, summarise
 from clsplat.errors import InputError, OutputError
 from clsplat.evaluation import chart_style
@@ -69,13 +67,11 @@ def test_a_cost_that_was_not_measured_has_no_point() -> None:
 
 
 def test_runs_of_several_lengths() -> None:
-    """The cap with most systems counts. A run of one length, an automatic and a failed run are left out."""
+    """The cap with most systems counts. A run of one length and a failed run are left out."""
     others = [
         run_record("gaussian", 2000, 25.0, iterations=100),
         run_record("gaussian", 2000, 26.0, iterations=200),
         run_record("3dgs", 1000, 25.0, iterations=100),
-        run_record("auto default", 1000, 27.0, iterations=100),
-        run_record("auto default", 1000, 28.0, iterations=200),
         run_record("default", 1000, 0.0, iterations=800, shape="skew-normal", failed="no memory")
         | {"psnr": None, "ssim": None},
         run_record("gaussian", 1000, 30.0, iterations=100, scene="attic"),
@@ -158,13 +154,12 @@ def test_points_and_fronts() -> None:
     assert [(p["system"], p["cap"], p["front_splats"]) for p in points] == [
         ("gaussian", 1000, False),
         ("default", 1000, True),
-        ("auto default", 1500, True),
+        ("half-gaussian", 1500, True),
         ("gaussian", 2000, False),
         ("default", 2000, False),
         ("gaussian", 4000, False),
         ("default", 4000, True),
     ]
-    assert [p["auto"] for p in points].count(True) == 1
     assert points[0]["render_ms"] == 10
     assert points[0]["shape"] == "gaussian"
 
@@ -197,33 +192,6 @@ def test_equal_quality() -> None:
     assert [row["splats"] for row in other][-1] is None
     assert equal_table(other, "default")[1][0][-1] == "not reached"
     assert equal_rows(point_rows(sweep_records()), "none") == []
-
-
-def test_automatic_runs_are_set_beside_the_best_of_their_shape() -> None:
-    (row,) = auto_rows(point_rows(sweep_records()))
-    assert (row["best_cap"], row["front"]) == (4000, "render_ms bytes splats")
-    assert row["lost"] == pytest.approx(0.05)
-    assert row["splats_ratio"] == row["bytes_ratio"] == pytest.approx(0.375)
-    assert auto_table([row])[1][0][3:] == (
-        "1500",
-        "0.30",
-        "4000",
-        "22.50",
-        "0.05",
-        "38",
-        "38",
-        "render_ms bytes splats",
-    )
-    (alone,) = auto_rows(point_rows([record for record in sweep_records() if record["system"] != "default"]))
-    assert alone["lost"] is None
-    assert auto_table([alone])[1][0][5] == ""
-    assert [is_auto(label) for label in ("auto", "auto 20 dB", "auto:x=1", "automatic", "default")] == [
-        True,
-        True,
-        True,
-        False,
-        False,
-    ]
 
 
 def test_curves_are_of_the_cap_that_most_were_followed_at() -> None:
@@ -345,7 +313,7 @@ def test_an_interrupted_sweep_leaves_charts_and_goes_on(
     assert [(row["system"], row["cap"]) for row in shown] == [("gaussian", 20), ("default", 20), ("gaussian", 40)]
     assert (tmp_path / "report.html").exists()
     with pytest.warns(UserWarning, match=r"clsplat\[charts\]"):
-        records = sweep(*arguments, more=[run_record("auto", 30, 25.0)])
+        records = sweep(*arguments, more=[run_record("gaussian", 30, 25.0)])
     assert made == [20, 20, 40, 40, 40]
     assert len(records) == 4
     shown = json.loads((tmp_path / "charts" / "size.json").read_text())

@@ -53,7 +53,7 @@ def curve_points(last: float) -> list[dict[str, float]]:
 
 
 def sweep_records(scene: str = "yard") -> list[Record]:
-    """Runs of two systems at three caps, and an automatic run.
+    """Runs of two systems at three caps, and of a third one at a single cap.
 
     The second system with n splats is as good as the first one with sqrt(2) n splats.
     """
@@ -65,7 +65,7 @@ def sweep_records(scene: str = "yard") -> list[Record]:
         run_record("default", cap, psnr, scene=scene, shape="skew-normal", curve=curve_points(psnr))
         for cap, psnr in ((1000, 20.5), (2000, 21.5), (4000, 22.5))
     ]
-    return [*runs, run_record("auto default", 1500, 22.45, scene=scene, shape="skew-normal", iterations=300)]
+    return [*runs, run_record("half-gaussian", 1500, 22.45, scene=scene, shape="half-gaussian")]
 
 
 def length_records(scene: str = "yard") -> list[Record]:
