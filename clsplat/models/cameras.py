@@ -30,6 +30,17 @@ OPAQUE = 0.5  # splats of at least this opacity become points of a model
 _COLMAP_FILES = ("cameras", "images", "points3D")
 
 
+@dataclass(frozen=True, eq=False)
+class _Exported:
+    """What is written: registered photos, points, and of each photo its file, its mask, and whether it is held out."""
+
+    photos: list[RegisteredImage]
+    points: Points
+    files: list[Path]
+    masks: list[Path | None]
+    held_out: list[bool]
+
+
 @dataclass(frozen=True)
 class ExportedCameras:
     """Numbers of the cameras and points that `export_cameras` wrote."""
@@ -80,24 +91,20 @@ def export_cameras(
         raise InputError(f"{source}: is a scene, which has no iterations; name a model, or leave out the iteration")
     if images is not None and not is_scene:
         raise InputError(f"{source}: is not a scene with photos; name a scene, or leave out the folder of photos")
-    if is_scene:
-        photos, photo_files, points, masks, held_out = _of_scene(source, images)
-    else:
-        photos, points = _of_model(source, iteration)
-        photo_files = [output.parent / "images" / photo.name for photo in photos]
-        masks, held_out = [None] * len(photos), [False] * len(photos)
+    found = _of_scene(source, images) if is_scene else _of_model(source, iteration, output.parent / "images")
     if form == "cameras":
-        _write_3dgs(output, photos)
-        return ExportedCameras(len(photos), 0)
+        _write_3dgs(output, found.photos)
+        return ExportedCameras(len(found.photos), 0)
     if form == "transforms":
-        if len(points):
+        if len(found.points):
             refuse_existing([points_file(output)], overwrite)
         place = output.parent
-        mask_paths = [None if mask is None else relative_files([mask], place)[0] for mask in masks]
-        write_transforms(output, photos, relative_files(photo_files, place), points, mask_paths, held_out)
+        masks = [None if mask is None else relative_files([mask], place)[0] for mask in found.masks]
+        names = relative_files(found.files, place)
+        write_transforms(output, found.photos, names, found.points, masks, found.held_out)
     else:
-        write_colmap(output, photos, points, form == "colmap-text")
-    return ExportedCameras(len(photos), len(points))
+        write_colmap(output, found.photos, found.points, form == "colmap-text")
+    return ExportedCameras(len(found.photos), len(found.points))
 
 
 def _is_scene(source: Path) -> bool:
@@ -112,29 +119,27 @@ def _is_scene(source: Path) -> bool:
     return isinstance(content, dict) and "frames" in content
 
 
-def _of_scene(
-    scene: Path, images: str | None
-) -> tuple[list[RegisteredImage], list[Path], Points, list[Path | None], list[bool]]:
-    """Return the photos, their files, points, masks, and which photos the scene's files hold out.
-
-    Names of photos omit a folder that all photos are in.
-    """
+def _of_scene(scene: Path, images: str | None) -> _Exported:
+    """Return what is written of a scene. Names of photos omit a folder that all photos are in."""
     posed = read_posed_images(scene, images)
     warn_of_left_out(scene, posed.left_out, len(posed.listed))
     masks = find_masks(scene, posed, None)
     folders = {photo.name.partition("/")[0] if "/" in photo.name else None for photo in posed.photos}
     cut = len(folders.pop() or "") + 1 if len(folders) == 1 and None not in folders else 0
-    return (
+    return _Exported(
         [replace(photo, name=photo.name[cut:]) for photo in posed.photos],
-        [posed.files[photo.name] for photo in posed.photos],
         posed.points,
+        [posed.files[photo.name] for photo in posed.photos],
         [masks.get(photo.name) for photo in posed.photos],
         [photo.name in (posed.test_names or ()) for photo in posed.photos],
     )
 
 
-def _of_model(source: Path, iteration: int | None) -> tuple[list[RegisteredImage], Points]:
-    """Return the cameras of a model or a file as photos, and the opaque splats of a model as points."""
+def _of_model(source: Path, iteration: int | None, images: Path) -> _Exported:
+    """Return the cameras of a model or a file as photos, and the opaque splats of a model as points.
+
+    images : folder that the photos would be in.
+    """
     if source.is_file() and source.suffix == ".json":
         named, points = _of_file(source), _points(np.empty((0, 3)), np.empty((0, 3), np.uint8))
     else:
@@ -147,7 +152,8 @@ def _of_model(source: Path, iteration: int | None) -> tuple[list[RegisteredImage
         camera = entry.camera
         lens = make_lens("PINHOLE", camera.width, camera.height, [camera.fx, camera.fy, camera.cx, camera.cy])
         photos.append(RegisteredImage(f"{entry.name}.png", camera.cam_from_world, lens))
-    return photos, points
+    files = [images / photo.name for photo in photos]
+    return _Exported(photos, points, files, [None] * len(photos), [False] * len(photos))
 
 
 def _of_file(path: Path) -> list[NamedCamera]:
