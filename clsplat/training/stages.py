@@ -110,6 +110,8 @@ class StagesState:
 class StepReports:
     """Sends messages and reports of runs to a display, with the step of the training that they belong to.
 
+    A message that several runs have, such as a hint on the photos, is sent once.
+
     Parameters
     ----------
     report : the display; None without one. steps : number of steps. iterations : of a run, for messages.
@@ -121,6 +123,7 @@ class StepReports:
 
     def __init__(self, report: Callable[[Progress], None] | None, steps: int, iterations: int) -> None:
         self._report, self._steps, self._iterations, self._step = report, steps, iterations, 1
+        self._sent: set[str] = set()
         self.progress: Callable[[Progress], None] | None = report and self._with_step
 
     def tell(self, step: int, message: str) -> None:
@@ -131,5 +134,8 @@ class StepReports:
             self._report(Progress.note(text, self._iterations))
 
     def _with_step(self, report: Progress) -> None:
-        if self._report is not None:
-            self._report(replace(report, phase=f"step {self._step} of {self._steps}"))
+        if self._report is None or report.message in self._sent:
+            return
+        if report.message:
+            self._sent.add(report.message)
+        self._report(replace(report, phase=f"step {self._step} of {self._steps}"))

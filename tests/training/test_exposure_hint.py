@@ -13,6 +13,7 @@ from clsplat.training.config import TrainConfig
 from clsplat.training.exposure_hint import exposure_hint, exposure_spread
 from clsplat.training.log import Progress
 from clsplat.training.run import train
+from clsplat.training.stages import StepReports
 
 CONFIG = TrainConfig(iterations=3, cap_max=50, sh_degree=0)
 
@@ -79,3 +80,25 @@ def test_points_of_one_colour_say_nothing(scene: Scene) -> None:
     grey = replace(scene.points, rgb=np.full_like(scene.points.rgb, 128))
     assert exposure_spread(scene.train, grey) is None
     assert exposure_spread(scene.train, scene.points) is not None
+
+
+def test_a_training_in_steps_says_it_once() -> None:
+    """Each run of its steps has the hint. Messages of other runs and numbers are sent as they are."""
+    heard: list[Progress] = []
+    steps = StepReports(heard.append, 2, 10)
+    assert steps.progress is not None
+    for step in (1, 2):
+        steps.tell(step, "a run")
+        for message in ("a hint", f"of run {step}", "", ""):
+            steps.progress(Progress.note(message, 10))
+    assert [(report.phase, report.message) for report in heard] == [
+        ("", "step 1 of 2, a run"),
+        ("step 1 of 2", "a hint"),
+        ("step 1 of 2", "of run 1"),
+        ("step 1 of 2", ""),
+        ("step 1 of 2", ""),
+        ("", "step 2 of 2, a run"),
+        ("step 2 of 2", "of run 2"),
+        ("step 2 of 2", ""),
+        ("step 2 of 2", ""),
+    ]
