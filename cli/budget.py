@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,6 +96,8 @@ def run_search(
     except KeyboardInterrupt:
         report_interruption(ctx, model_path, cluster)
     charts = draw_search(result.report, model_path)
+    if (missed := result.report["final"]["missed"]) is not None:
+        warnings.warn(missed, stacklevel=2)
     if quiet:
         return
     for line in result_lines(result):
@@ -109,11 +112,10 @@ def result_lines(result: Budgeted) -> list[str]:
     """Return the lines that describe the result of the search."""
     report, final = result.report, result.report["final"]
     held_out = report["held_out"]
-    lines = [
+    return [
         f"rounds: {final['splats']} of {report['rounds'][0]['splats']} splats remain",
         f"validation views: PSNR {held_out['psnr_pruned']:.2f} dB, with all splats and parameters "
         f"{report['rounds'][0]['psnr']:.2f} dB",
         f"{result.path}: {final['splats']} splats, {final['skewed_fraction']:.0%} skewed, "
         f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {result.seconds:.0f} s in total",
     ]
-    return lines + [f"warning: {final['missed']}"] * (final["missed"] is not None)

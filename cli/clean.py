@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .command import SectionedCommand
-from .models import scene_choice
+from .models import cost_line, missing_numbers, scene_choice
 from .options import (
     PATH,
     Decibels,
@@ -116,7 +116,7 @@ def clean_model(
             model, output, scene=scene, background=background, use_photos=False if no_photos else None, **values
         )
     if not quiet:
-        for line in _summary(result):
+        for line in (*_summary(result), *_losses(result, values["device"])):
             click.echo(line)
 
 
@@ -141,6 +141,20 @@ def _summary(result: CleanedModel) -> list[str]:
     lines += _measured("training views", cleaned.before, cleaned.after)
     lines += _measured("test views, not used to decide", result.test_before, result.test_after)
     lines.append("nothing was written" if result.output is None else f"written: {result.output}")
+    return lines
+
+
+def _losses(result: CleanedModel, device: str | None) -> list[str]:
+    """Return lines on what the written file lacks of the cleaned model."""
+    from clsplat.models.convert import conversion_cost
+
+    written = result.written
+    if written is None:
+        return []
+    lines = missing_numbers(written)
+    if written.rounds:
+        cost = conversion_cost(written, device=device)
+        lines.append(f"the file is rounded; {'what that costs was not measured' if cost is None else cost_line(cost)}")
     return lines
 
 

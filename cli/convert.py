@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -15,10 +14,8 @@ from clsplat.splats.formats.streamed_sog import MAX_LEVELS
 from clsplat.splats.shapes import SHAPES
 
 from .command import SectionedCommand
+from .models import cost_line, missing_numbers
 from .options import PATH, device_option, iteration_option, overwrite_option, quiet_option
-
-if TYPE_CHECKING:
-    from clsplat.models.convert import ConversionCost
 
 
 @click.command(
@@ -159,21 +156,14 @@ def convert_model(
     click.echo(f"{output}: {len(after)} splats, {before.shape} to {after.shape}, {how}")
     if converted.removed:
         click.echo(f"{converted.removed} splats of negative opacity are left out, which {after.shape} does not support")
-    if converted.lacks_near_plane:
-        click.echo(f"the near plane is not in the file: splats nearer than {after.near_plane:.4g} units are drawn")
-    if converted.lacks_antialiasing:
-        click.echo("the file does not say that its splats are antialiased: programs draw small splats too thick")
-    elif converted.lacks_low_pass:
-        click.echo(f"the low pass of {after.low_pass:g} px² is not in the file: programs blur a little more")
+    for line in missing_numbers(converted):
+        click.echo(line)
     if not converted.is_exact:
-        click.echo(_cost_line(conversion_cost(converted, cameras, device)))
+        cost = conversion_cost(converted, cameras, device)
+        click.echo(
+            "what that costs was not measured: name cameras with --cameras FILE" if cost is None else cost_line(cost)
+        )
     for number, (level, cost) in enumerate(
         zip_longest(converted.levels, level_costs(converted, cameras, device)), start=1
     ):
         click.echo(f"level {number}: {len(level)} splats" + ("" if cost is None else f", {cost.mean:.2f} dB"))
-
-
-def _cost_line(cost: ConversionCost | None) -> str:
-    if cost is None:
-        return "what that costs was not measured: name cameras with --cameras FILE"
-    return f"PSNR against the model's own images, {cost.cameras} cameras: {cost.mean:.2f} dB, worst {cost.worst:.2f} dB"

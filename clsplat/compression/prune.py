@@ -7,6 +7,7 @@ use what one kind leaves of its share.
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -122,7 +123,9 @@ def prune(
     views_before = validation.per_view(splats)
 
     def surely(candidate: Splats) -> float:
-        """Return the PSNR less the standard error of the loss."""
+        """Return the PSNR less the standard error of the loss; minus infinity without splats."""
+        if not len(candidate):  # no tolerance is worth an empty model
+            return -math.inf
         found = validation.per_view(candidate)
         return statistics.fmean(found) - standard_error(views_before, found)
 

@@ -5,6 +5,7 @@ Files that clsplat names itself, in a folder that it made, are written again wit
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -34,7 +35,7 @@ def refuse_existing(paths: Iterable[str | Path], overwrite: bool = False, inputs
         written.add(place)
         if path.exists() and not path.is_file():
             raise OutputError(f"{path}: is not a file: choose another name")
-        if path.exists() and not overwrite:
+        if os.path.lexists(path) and not overwrite:  # also a symbolic link to a file that is not there
             raise OutputError(f"{path}: exists already: use --overwrite or another name")
         if path.parent not in places:
             _check_place(path)

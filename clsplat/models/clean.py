@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from .. import activity
@@ -24,6 +24,7 @@ from ..splats.formats.page_payload import PAGE_ENDING
 from ..splats.splats import Splats
 from ..training.exposure_file import copy_exposures
 from ..training.folder import ModelFolder
+from .convert import ConvertedModel
 from .model import LoadedModel, SceneChoice, model_at
 
 TOLERANCE = 0.05  # dB
@@ -46,6 +47,14 @@ class CleanedModel:
     cleaned: Cleaned
     test_before: Evaluation | None = None
     test_after: Evaluation | None = None
+
+    @property
+    def written(self) -> ConvertedModel | None:
+        """What the file holds of the cleaned splats; None if nothing or a folder was written, which holds all."""
+        if self.output is None or not self.output.suffix:
+            return None
+        splats = self.cleaned.splats
+        return ConvertedModel(replace(self.source, splats=splats), self.output, splats, False)
 
 
 def clean_model(

@@ -76,6 +76,11 @@ class ConvertedModel:
         return self.splats.antialiased and not self._written.antialiased
 
     @property
+    def lacks_bands(self) -> bool:
+        """Whether the splats have SH bands above 0, and the file does not hold any."""
+        return self.splats.sh_degree > 0 and not self._written.bands
+
+    @property
     def rounds(self) -> bool:
         """Whether the file holds fewer digits than float32."""
         return self._written.rounds

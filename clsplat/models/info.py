@@ -75,8 +75,8 @@ def _is_scene(path: Path) -> bool:
         return path.is_file() and is_scene(path) and path.name not in READ_NAMES
     if is_scene(path):
         return True
-    if ModelFolder(path).is_used:
-        return False  # load_model reports that the model has no point cloud yet
+    if ModelFolder(path).is_used or any((path / name).is_file() for name in READ_NAMES):
+        return False  # load_model reports what is missing
     if (hint := scene_hint(path)) is not None:
         raise InputError(hint)
     if is_photographs(path):

@@ -15,6 +15,7 @@ from ..files.existing import probe
 from ..files.json_file import read_object, write_json
 from ..files.lock import folder_lock
 from ..files.real_path import real_path
+from ..splats.formats.any_file import READ_NAMES
 from ..splats.splats import Splats
 
 if TYPE_CHECKING:
@@ -108,6 +109,9 @@ class ModelFolder:
             raise InputError(
                 f"{self.path}: its training has written no point cloud yet: continue it with clsplat train --resume"
             )
+        for name in READ_NAMES if not found else ():
+            if (self.path / name).is_file():
+                raise InputError(f"{self.path}: is a folder of SOG: name {self.path / name}")
         if not found:
             raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: train a model first")
         if iteration is not None and iteration not in found:

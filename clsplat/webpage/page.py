@@ -14,7 +14,7 @@ from ..cameras.camera import Camera
 from ..cameras.cameras_json import NamedCamera
 from ..cameras.orbits import ellipse
 from ..cameras.path import CameraPath
-from ..errors import InputError
+from ..errors import InputError, named_place
 from ..files.atomic import atomic_writer
 from ..files.file_names import printable
 from ..files.html_page import escape, package_text
@@ -75,7 +75,8 @@ def write_web_page(
     ------
     InputError : there is no splat, or the precision is unknown. OutputError : the file cannot be written.
     """
-    text = page_text(splats, content, precision)
+    with named_place(str(path)):
+        text = page_text(splats, content, precision)
     with atomic_writer(Path(path)) as stream:
         stream.write(text.encode())
 
@@ -85,7 +86,7 @@ def page_text(splats: Splats, content: PageContent, precision: str = PRECISIONS[
     if precision not in PRECISIONS:
         raise InputError(f"unknown precision {precision!r}: choose {' or '.join(PRECISIONS)}")
     if not len(splats):
-        raise InputError(f"{content.title}: the model has no splats to show; train it first")
+        raise InputError("the model has no splats to show; train it first")
     if splats.shape not in PAGE_SHAPES:
         raise InputError(f"a page draws {_DRAWN} splats, not {splats.shape}; see `as_drawn`")
     payload = pack(splats.stored(), precision)

@@ -150,6 +150,13 @@ def test_a_finished_search_is_not_resumed_or_replaced(found: tuple[Path, str], s
     assert "not a number of decibels" in error_of("train", scene, "--target-psnr", "x", code=2)
 
 
+def test_a_missed_target_is_a_warning_also_of_a_quiet_search(scene: Path, tmp_path: Path) -> None:
+    result = run("train", scene, "-m", tmp_path / "model", "--target-psnr", 60, "-q", *SEARCH)
+    assert result.exit_code == 0
+    assert result.stdout == ""
+    assert "warning: target PSNR 60 dB was not reached" in result.stderr
+
+
 def test_an_interrupted_search_prints_how_to_continue(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -273,3 +274,14 @@ def test_wrong_cameras_stop_the_command_before_it_writes(model: Path, tmp_path: 
     out = tmp_path / "out.ply"
     assert "nothere.json" in error_of("convert", model, out, "--cameras", tmp_path / "nothere.json")
     assert not out.exists()
+
+
+def test_a_folder_of_sog_names_its_file(tmp_path: Path) -> None:
+    splats = Splats("gaussian", random_model(GAUSSIAN, 9, 0, dead=0))
+    splats.save(tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path / "folder")
+    hint = f"is a folder of SOG: name {tmp_path / 'folder' / 'meta.json'}"
+    assert hint in error_of("info", tmp_path / "folder")
+    assert hint in error_of("convert", tmp_path / "folder", tmp_path / "b.ply")
+    assert len(Splats.load(tmp_path / "folder" / "meta.json")) == 9

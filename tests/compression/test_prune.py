@@ -102,6 +102,10 @@ def test_more_tolerance_leaves_less(splats: Splats, scene: Scene, validation: Va
     assert sizes[0] > sizes[1] > sizes[2]
 
 
+def test_no_tolerance_leaves_an_empty_model(splats: Splats, scene: Scene, validation: Validation) -> None:
+    assert len(prune(splats, scene.train, validation, 1000.0).splats) > 0
+
+
 def test_kinds_are_left_alone_unless_asked_for(splats: Splats, scene: Scene, validation: Validation) -> None:
     pruned = prune(splats, scene.train, validation, 0.3, ("bands",))
     np.testing.assert_array_equal(pruned.splats.skew, splats.skew)

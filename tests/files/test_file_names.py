@@ -40,6 +40,17 @@ def test_two_outputs_never_share_a_file(ignores_case: bool, tmp_path: Path) -> N
         refuse_existing(paths[:1], overwrite=True, inputs=paths[1:])
 
 
+def test_a_link_to_a_missing_file_is_not_replaced_unasked(tmp_path: Path) -> None:
+    link = tmp_path / "model.ply"
+    try:
+        link.symlink_to("missing.ply")
+    except OSError:
+        pytest.skip("no symbolic links here")
+    with pytest.raises(OutputError, match="exists already"):
+        refuse_existing([link])
+    refuse_existing([link], overwrite=True)
+
+
 def test_two_photos_never_share_a_name_in_a_scene(ignores_case: bool) -> None:
     names = _scene_names(["A.tif", "a.png", "b.tif", "B.bmp"])
     assert names == (

@@ -46,19 +46,21 @@ class WrittenFormat:
     rounds : whether the file holds fewer digits than float32.
     numbers : whether the file holds the near plane and the low pass of the model.
     antialiased : whether the file says that a model is antialiased.
+    bands : whether the file holds SH bands above 0.
     """
 
     shapes: tuple[str, ...] | None
     rounds: bool
     numbers: bool = True
     antialiased: bool = True
+    bands: bool = True
 
 
 _GAUSSIAN_ONLY, _EXTENDED = (GAUSSIAN.name,), tuple(EXTRA_FIELDS)
 # By ending or whole name, in the order of messages. `clsplat convert` writes pages, because they have cameras as well.
 WRITTEN = {
     PLY_ENDING: WrittenFormat(None, False),
-    SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False, False),
+    SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False, False, False),
     SPZ_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False),
     SOG_ENDING: WrittenFormat((GAUSSIAN.name, SKEW_NORMAL.name), True),
     LOD_META: WrittenFormat(_GAUSSIAN_ONLY, True),

@@ -79,7 +79,7 @@ def write_gltf_splats(path: str | os.PathLike[str], splats: StoredSplats) -> Non
         raise InputError(f"{path}: .glb files hold {', '.join(_KERNELS)} splats, not {splats.shape}; convert them")
     if not len(splats.arrays["mean"]):
         raise InputError(f"{path}: the model has no splats, and glTF has no empty arrays: write a .ply")
-    attributes = _attributes(splats)
+    attributes = _attributes(path, splats)
     extension: Json = {
         "kernel": _KERNELS[splats.shape],
         "colorSpace": _SRGB,
@@ -114,9 +114,9 @@ def write_gltf_splats(path: str | os.PathLike[str], splats: StoredSplats) -> Non
     write_glb(path, document, attributes)
 
 
-def _attributes(splats: StoredSplats) -> dict[str, NDArray[Any]]:
-    """Return the attributes of the primitive, (N, width) each."""
-    values = activated(splats, LUF)
+def _attributes(path: str | os.PathLike[str], splats: StoredSplats) -> dict[str, NDArray[Any]]:
+    """Return the attributes of the primitive, (N, width) each. path : file to write, for messages."""
+    values = activated(path, splats, LUF)
     sh, opacity = values["sh"], values[OPACITY][:, None]
     color = np.clip(0.5 + SH_C0 * sh[:, 0], 0.0, 1.0)
     single = {

@@ -49,6 +49,7 @@ _OPEN, _CLOSE = b'<script id="payload" type="text/plain">', b"</script>"
 _MAX_TEXT = 1 << 16  # bytes of the JSON text
 _MAX_RATIO = 1100  # of a gzip stream; above its limit, 1032
 _FLAT = 20.0  # a scale that is e^20 times smaller than the largest one might as well be 0
+_HUGE = 10.0  # a scale that is e^10 times larger than the median is that of a stray splat: nobody sees where it ends
 _GZIP = 31  # of zlib's window: with the header of gzip
 _LEVEL = 6
 
@@ -258,6 +259,8 @@ def _range(column: _Column, values: Array) -> dict[str, list[float]]:
     high = values.max(axis=0)
     low = values.min(axis=0)
     if column.name == "log_scale":
+        # A stray splat must not clip all others.
+        high = np.minimum(high, np.median(values, axis=0) + _HUGE)
         low = np.maximum(low, high - _FLAT)
     return {"low": low.tolist(), "high": high.tolist()}
 

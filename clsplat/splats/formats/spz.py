@@ -52,6 +52,8 @@ VERSIONS = (GZIP_VERSION, ZSTD_VERSION)  # that are written, the default first
 
 _MAX_FIXED = (1 << 23) - 1  # the largest fixed-point position
 _SCALES = (-10.0 - 0.5 / 16, 255.5 / 16 - 10.0)  # logarithms of the scales that a byte holds
+_MEAN_ROUNDING = 0.25  # of a step: the mean error of a rounded position
+_MOVED = 0.1  # of the median size: positions that are rounded more than this are warned of
 _FRACTION_BITS = 20  # the most that are used; positions then reach 8 units
 _FINE, _COARSE = 2, 4  # quantisation steps of SH band 1 and of the others
 _RDF = 6  # the coordinate system of a PLY
@@ -69,7 +71,7 @@ def write_spz(path: str | os.PathLike[str], splats: StoredSplats, version: int =
 
     Warns
     -----
-    UserWarning : the sizes of some splats are clipped.
+    UserWarning : the sizes of some splats are clipped, or a far splat leaves few digits for the positions of all.
     """
     check_gaussian(path, splats.shape, ".spz")
     if version not in VERSIONS:
@@ -82,6 +84,7 @@ def write_spz(path: str | os.PathLike[str], splats: StoredSplats, version: int =
         )
     bits = min(_FRACTION_BITS, math.floor(math.log2(_MAX_FIXED / max(farthest, 1e-30))))
     _warn_of_sizes(path, arrays["log_scale"])
+    _warn_of_places(path, arrays["log_scale"], farthest, 2.0**-bits)
     degree = sh_degree_of(arrays["sh"].shape[1])
     header = SpzHeader(version, len(arrays["mean"]), degree, bits, ANTIALIASED * splats.antialiased)
     parts: list[NDArray[Any]] = [
@@ -96,6 +99,25 @@ def write_spz(path: str | os.PathLike[str], splats: StoredSplats, version: int =
         data = write_container(header, [part.tobytes() for part in parts])
     with atomic_writer(path) as stream:
         stream.write(data)
+
+
+def _warn_of_places(
+    path: str | os.PathLike[str], log_scale: NDArray[np.floating], farthest: float, step: float
+) -> None:
+    """Warn if rounded positions move splats by a part of their size. The farthest splat decides the step.
+
+    step : distance of two positions that the file holds [world units].
+    """
+    if not len(log_scale):
+        return
+    size = math.exp(np.median(np.clip(log_scale.max(axis=1), *_SCALES)))
+    if _MEAN_ROUNDING * step > _MOVED * size:
+        warnings.warn(
+            f"{path}: a splat lies {farthest:.3g} units away, so .spz holds positions in steps of {step:.2g} units, "
+            f"and half of the splats are smaller than {size:.2g}: remove far splats (clsplat clean), or write a .ply "
+            "or a .sog",
+            stacklevel=3,
+        )
 
 
 def _warn_of_sizes(path: str | os.PathLike[str], log_scale: NDArray[np.floating]) -> None:

@@ -15,8 +15,10 @@ import io
 import json
 import os
 import re
+import struct
 import subprocess
 import sys
+import zipfile
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -45,6 +47,12 @@ _REFUSED = 3  # exit code of the reading process if it refuses the file
 _MEMORY, _MEMORY_OF_BYTE = 3 << 30, 40  # of that process, so that a false size in a file cannot take all memory
 # Each thread reserves address space, which the limit counts.
 _FEW_THREADS = {"PXR_WORK_THREAD_LIMIT": "1", "MALLOC_ARENA_MAX": "2", "OPENBLAS_NUM_THREADS": "1"}
+_ARGUMENTS = ":SDF_FORMAT_ARGS:"  # begins the arguments of a layer in its name
+_CONTROL = re.compile(r"[\x00-\x1f]")  # not in names of an archive's members
+# Zip archives: place of the time and date in the header of a member, and in its entry of the directory. Length of an
+# entry without its texts. Place of the lengths of these texts.
+_LOCAL_TIME, _ENTRY_TIME, _ENTRY, _LENGTHS = 10, 12, 46, 28
+_FIRST_DAY = struct.pack("<HH", 0, 1 << 5 | 1)  # midnight of 1980-01-01, the first that zip archives know
 _SUPPORT = 3.0  # standard deviations: the extent of a splat in bounding boxes
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _DEGREE = "radiance:sphericalHarmonicsDegree"
@@ -72,19 +80,23 @@ def write_usd(path: str | os.PathLike[str], splats: StoredSplats) -> None:
     _check_library(path)
     from pxr import Sdf, Tf, Usd, UsdUtils
 
-    if printable(os.fspath(path)) != os.fspath(path):
-        raise OutputError(f"{printable(os.fspath(path))}: usd-core takes names in UTF-8 only: choose another name")
+    whole = os.fspath(path)
+    if printable(whole) != whole:
+        raise OutputError(f"{printable(whole)}: usd-core takes names in UTF-8 only: choose another name")
+    if _ARGUMENTS in whole or (whole.lower().endswith(USD_ENDINGS[-1]) and _CONTROL.search(Path(path).name)):
+        raise OutputError(f"{path}: usd-core takes no such name: choose another name")
     try:
         with atomic_path(path) as temporary:
             packed = temporary.suffix.lower() == USD_ENDINGS[-1]
             layer = temporary.with_suffix(".usdc") if packed else temporary
             try:
                 stage = Usd.Stage.CreateNew(str(layer))
-                _define(stage, splats)
+                _define(stage, path, splats)
                 stage.GetRootLayer().Save()
                 if packed:
-                    name = Path(path).with_suffix(".usdc").name
+                    name = Path(path).with_suffix(".usdc").name  # of the layer in the archive
                     UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(temporary), name)
+                    _without_times(temporary)
             finally:
                 if packed:
                     layer.unlink(missing_ok=True)
@@ -92,15 +104,30 @@ def write_usd(path: str | os.PathLike[str], splats: StoredSplats) -> None:
         raise OutputError(f"{path}: cannot be written ({_reason(error)}); check place, rights and free space") from None
 
 
-def _define(stage: Any, splats: StoredSplats) -> None:
-    """Define the splats on an empty stage."""
+def _without_times(archive: Path) -> None:
+    """Set the times of all members of a zip archive to 1980-01-01, so that equal models give equal bytes."""
+    with zipfile.ZipFile(archive) as opened:
+        members, start = opened.infolist(), opened.start_dir
+    with archive.open("r+b") as stream:
+        place = start
+        for member in members:
+            stream.seek(place)
+            lengths = struct.unpack_from("<HHH", stream.read(_ENTRY), _LENGTHS)
+            for at in (member.header_offset + _LOCAL_TIME, place + _ENTRY_TIME):
+                stream.seek(at)
+                stream.write(_FIRST_DAY)
+            place += _ENTRY + sum(lengths)
+
+
+def _define(stage: Any, path: str | os.PathLike[str], splats: StoredSplats) -> None:
+    """Define the splats on an empty stage. path : file to write, for messages."""
     from pxr import Gf, Sdf, UsdGeom, Vt
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     prim = stage.DefinePrim(_PRIM, _TYPE)
     stage.SetDefaultPrim(prim)
-    values = activated(splats, RUB)
+    values = activated(path, splats, RUB)
 
     def put(name: str, kind: Any, value: Any, custom: bool = False) -> Any:
         attribute = prim.CreateAttribute(name, kind, custom, Sdf.VariabilityVarying if not custom else _uniform())

@@ -104,6 +104,16 @@ def test_a_flat_splat_does_not_make_the_scales_of_others_coarse() -> None:
     np.testing.assert_allclose(after, arrays["log_scale"], atol=0.011)
 
 
+def test_a_stray_splat_does_not_make_the_scales_of_others_coarse() -> None:
+    """Runs of other programs that went wrong leave splats of any size."""
+    arrays = random_model(GAUSSIAN, 50, 0)
+    arrays["log_scale"][3] = 80
+    after = unpack("page", pack(StoredSplats("gaussian", "peak", False, arrays))).arrays["log_scale"]
+    others = np.arange(50) != 3
+    np.testing.assert_allclose(after[others], arrays["log_scale"][others], atol=0.011)
+    assert (after[3] > after[others].max(axis=0) + 5).all()
+
+
 def test_a_skew_normal_without_skew_is_a_gaussian() -> None:
     arrays = random_model(SKEW_NORMAL, 9, 0)
     arrays["skew"][:] = 0

@@ -271,6 +271,21 @@ def test_far_positions_take_bits_from_the_fraction(tmp_path: Path) -> None:
     assert len(Splats.load(tmp_path / "c.spz")) == 0
 
 
+@pytest.mark.parametrize(("far", "coarse"), [(1e5, False), (1e6, True)])
+def test_a_far_splat_that_moves_all_others_is_named(
+    tmp_path: Path, far: float, coarse: bool, recwarn: pytest.WarningsRecorder
+) -> None:
+    arrays = gaussians(n=10).to_numpy()
+    arrays["log_scale"][:] = np.log(0.1)
+    arrays["mean"][3, 1] = far
+    Splats("gaussian", arrays).save(tmp_path / "a.spz")
+    said = [str(warning.message) for warning in recwarn]
+    expected = (
+        f"{tmp_path / 'a.spz'}: a splat lies {far:.3g} units away, so .spz holds positions in steps of 0.12 units"
+    )
+    assert [text.startswith(expected) for text in said] == [True] * coarse
+
+
 def test_spz_says_whether_splats_are_antialiased(tmp_path: Path) -> None:
     for antialiased in (False, True):
         splats = Splats("gaussian", gaussians().arrays, antialiased=antialiased)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +177,35 @@ def test_other_files_and_missing_files(tmp_path: Path, name: str) -> None:
     Usd.Stage.CreateNew(str(tmp_path / "empty.usda")).Save()
     with pytest.raises(InputError, match="has no splats"):
         Splats.load(tmp_path / "empty.usda")
+
+
+def test_equal_models_give_equal_archives(tmp_path: Path) -> None:
+    """The members of a .usdz have no times."""
+    written = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        model().save(tmp_path / name / "model.usdz")
+        written.append((tmp_path / name / "model.usdz").read_bytes())
+    with zipfile.ZipFile(tmp_path / "a" / "model.usdz") as archive:
+        assert archive.testzip() is None
+        assert {member.date_time for member in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+    assert written[0] == written[1]
+
+
+@pytest.mark.parametrize("name", ["a\nb.usdz", "a\tb.usdz", "a:SDF_FORMAT_ARGS:b.usda", "a:SDF_FORMAT_ARGS:b.usdz"])
+def test_names_that_the_library_does_not_take(tmp_path: Path, name: str) -> None:
+    with pytest.raises(OutputError, match="usd-core takes no such name: choose another name"):
+        model().save(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", [".usdc", ".glb"])
+def test_scales_that_float32_does_not_hold_are_named(tmp_path: Path, ending: str) -> None:
+    splats = model()
+    arrays = splats.to_numpy()
+    arrays["log_scale"][2, 1] = 1e9
+    with pytest.raises(InputError, match=rf"model\{ending}: splat 2 has the scale e\^1e\+09"):
+        splats.with_arrays(arrays).save(tmp_path / f"model{ending}")
 
 
 def test_what_usd_files_do_not_hold_and_where_they_cannot_be(tmp_path: Path) -> None:
