@@ -6,12 +6,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ..device.device import Device
 from ..device.memory import Pool, fill_zero, to_device, to_host
 from ..device.opencl import Buffer
+from ..device.pending_arrays import PendingArrays
 from ..splats.fields import Array, Group, Schema, public_shape
 from ..splats.harmonics import sh_basis
 from ..splats.splats import Splats
@@ -71,6 +73,14 @@ class ParameterBuffers:
             to_host(self.device, self.buffers[field.group], rows, self._offset_bytes(name))
             arrays[name] = np.ascontiguousarray(rows[:, :n].T).reshape(public_shape(field, n))
         return arrays
+
+    def pending(self, n: int, names: Sequence[str] | None = None) -> PendingArrays:
+        """Return what `download` returns, but each field is read when it is asked for."""
+
+        def read(name: str) -> Array:
+            return self.download(n, (name,))[name]
+
+        return PendingArrays({name: partial(read, name) for name in (self.schema.names if names is None else names)})
 
     def _offset_bytes(self, name: str) -> int:
         return self.schema.offset(name) * self.capacity * self.dtype.itemsize

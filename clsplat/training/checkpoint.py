@@ -7,6 +7,7 @@ import lzma
 import math
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -46,8 +47,8 @@ class Checkpoint:
     ----------
     iteration : number of iterations done.
     config : the run's options, as JSON.
-    splats : public arrays by field.
-    optimizer : the optimizer's state by key.
+    splats : public arrays by field. The host holds those of a run one at a time (`PendingArrays`).
+    optimizer : the optimizer's state by key, in the same way.
     rng : state of the NumPy generator, as JSON.
     queue : training views that remain in this epoch.
     seconds : training time so far.
@@ -61,8 +62,8 @@ class Checkpoint:
 
     iteration: int
     config: dict[str, Any]
-    splats: dict[str, Array]
-    optimizer: dict[str, NDArray[Any]]
+    splats: Mapping[str, Array]
+    optimizer: Mapping[str, NDArray[Any]]
     rng: dict[str, Any]
     queue: list[int]
     seconds: float
@@ -70,7 +71,7 @@ class Checkpoint:
     n_first: int
     statistics: Array
     reached: Reached | None = None
-    average: dict[str, NDArray[Any]] = field(default_factory=dict)
+    average: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     left_out: list[int] = field(default_factory=list)
 
     @property
@@ -92,13 +93,14 @@ class Checkpoint:
             "reached": self.reached and asdict(self.reached),
             "left_out": self.left_out,
         }
-        arrays = {f"splats.{k}": v for k, v in self.splats.items()}
-        arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
-        arrays |= {f"average.{k}": v for k, v in self.average.items()}
-        arrays[_STATISTICS] = self.statistics
-        arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
-        with atomic_writer(path) as stream:
-            np.savez(stream, **arrays)  # type: ignore[arg-type]
+        single = {_STATISTICS: self.statistics, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)}
+        groups = {"splats.": self.splats, "optimizer.": self.optimizer, "average.": self.average, "": single}
+        # As `np.savez` does, which would hold all arrays at once.
+        with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
+            for prefix, arrays in groups.items():
+                for name in arrays:
+                    with archive.open(f"{prefix}{name}.npy", "w", force_zip64=True) as member:
+                        np.lib.format.write_array(member, arrays[name], allow_pickle=False)
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from ..device.device import Device
+from ..device.pending_arrays import PendingArrays
 from ..device.several import open_devices
 from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
@@ -353,12 +354,12 @@ class Trainer:
             raise TrainingError(f"iteration {self.iteration}: {error}: lower the learning rates") from None
 
     def checkpoint(self) -> Checkpoint:
-        """Return the state that the rest of the run depends on."""
+        """Return the state that the rest of the run depends on, to be used before the next iteration."""
         return Checkpoint(
             self.iteration,
             self.config.to_json(),
-            self.splats.download(self.splats.n),
-            self.optimizer.state() | self.exposure.state(),
+            self.splats.pending(self.splats.n),
+            PendingArrays.of(self.optimizer.pending(), self.exposure.state()),
             dict(self.rng.bit_generator.state),
             self.views.queue,
             self.seconds,

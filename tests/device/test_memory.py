@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from clsplat.device.device import Device
 from clsplat.device.memory import Pool, UploadQueue, to_device, to_host
 from clsplat.device.opencl import Buffer
+from clsplat.device.pending_arrays import PendingArrays
 from clsplat.errors import DeviceError
 
 
@@ -77,3 +81,22 @@ def test_uploads_beside_the_device_s_queue(device: Device) -> None:
     second = queue.send(buffer, values[::-1], after=first)
     queue.wait_on_device(second)
     np.testing.assert_array_equal(to_host(device, buffer, np.empty_like(values)), values[::-1])
+
+
+def test_pending_arrays_are_read_when_they_are_asked_for() -> None:
+    values = {"a": np.zeros(2), "b": np.ones(3)}
+    read: list[str] = []
+
+    def reader(name: str) -> NDArray[Any]:
+        read.append(name)
+        return values[name]
+
+    pending = PendingArrays.of(
+        PendingArrays({name: partial(reader, name) for name in values}), {"c": np.arange(4), "a": np.full(2, 5.0)}
+    )
+    assert (list(pending), len(pending), read) == (["a", "b", "c"], 3, [])
+    assert pending["a"].tolist() == [5.0, 5.0], "the last part counts"
+    values["b"] = np.full(3, 7.0)
+    assert pending["b"].tolist() == [7.0] * 3
+    assert read == ["b"]
+    assert set(dict(pending)) == {"a", "b", "c"}

@@ -9,6 +9,7 @@ import shutil
 import signal
 import threading
 import time
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -245,3 +246,27 @@ def test_reached_stages_are_in_the_checkpoint_and_older_checkpoints_have_none(fi
     del meta["reached"]
     np.savez(tmp_path / "old.npz", **arrays | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
     assert Checkpoint.load(tmp_path / "old.npz").iteration == 30
+
+
+@pytest.mark.parametrize("options", [{}, {"visible_adam": True}, {"half_moments": True}])
+def test_a_checkpoint_is_written_with_one_array_in_memory(
+    scene: Scene, tmp_path: Path, options: dict[str, bool]
+) -> None:
+    """Splats, moments and means of a large model are several times its size."""
+    trainer = Trainer(scene, CONFIG.replace(iterations=6, average_last=0.5, **options))
+    trainer.run()
+    largest = max(values.nbytes for values in trainer.splats.download(trainer.splats.n).values())
+    checkpoint = trainer.checkpoint()
+    whole = sum(values.nbytes for part in (checkpoint.splats, checkpoint.optimizer) for values in part.values())
+    tracemalloc.start()
+    checkpoint.save(tmp_path / "checkpoint.npz")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 3.5 * largest * trainer.splats.capacity / trainer.splats.n < whole
+    again = Checkpoint.load(tmp_path / "checkpoint.npz")
+    for name in ("splats", "optimizer", "average"):
+        stored, expected = getattr(again, name), getattr(checkpoint, name)
+        assert stored.keys() == expected.keys()
+        for key, values in stored.items():
+            np.testing.assert_array_equal(values, expected[key], err_msg=key)
+    assert again.average["count"].tolist() == [3]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...device.device import Device
 from ...device.memory import fill_zero, to_device, to_host
+from ...device.pending_arrays import PendingArrays
 from ...device.program import GROUP_ITEMS, Program, lane_group
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import CompactGradients, SplatBuffers
@@ -145,22 +148,22 @@ class FusedOptimizer:
         self._set_values(edit, source)
         self._reset_fields(edit.reset_fields)
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        n = self.splats.n
-        state: dict[str, NDArray[Any]] = {"steps": np.array([self.steps, self.skew.steps if self.skew else 0])}
-        state |= self.moments.state(n, self._base_names)
+    def pending(self) -> PendingArrays:
+        steps = {"steps": np.array([self.steps, self.skew.steps if self.skew else 0])}
+        rows: dict[str, StateRows] = {}
         if self.skew is not None:
-            state |= {
-                "skew_s": self.skew.s.get(n),
-                "first.skew": self.skew.first.get(n),
-                "second.skew": self.skew.second.get(n),
-            }
+            rows |= {"skew_s": self.skew.s, "first.skew": self.skew.first, "second.skew": self.skew.second}
         if self.momentum is not None:
-            state["momentum"] = self.momentum.get(n)
-        return state
+            rows["momentum"] = self.momentum
+        n = self.splats.n
+        others = PendingArrays({name: partial(each.get, n) for name, each in rows.items()})
+        return PendingArrays.of(steps, self.moments.pending(n, self._base_names), others)
 
-    def load_state(self, state: dict[str, NDArray[Any]]) -> None:
-        check_state(state, self.state())
+    def state(self) -> dict[str, NDArray[Any]]:
+        return dict(self.pending())
+
+    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        check_state(state, self.pending())
         self.steps = int(state["steps"][0])
         self.moments.load_state(state, self._base_names)
         if self.skew is not None:

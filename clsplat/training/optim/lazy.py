@@ -20,6 +20,7 @@ Positions with regularisers, noise or SGHMC change in every step, also without a
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from ...device.device import Device
 from ...device.memory import copy as copy_buffer
 from ...device.memory import send_to_device, to_device, to_host
+from ...device.pending_arrays import PendingArrays
 from ...device.program import GROUP_ITEMS
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import CompactGradients, SplatBuffers
@@ -140,12 +142,12 @@ class VisibleOptimizer(FusedOptimizer):
         self.settle()  # no splat has skipped a step now, so it does not matter which ones move
         super().apply(edit)
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def pending(self) -> PendingArrays:
         last = to_host(self.device, self._last, np.empty((2, self._vectors), np.uint32))
         lazy = {"waiting.last": last[:, : self._used].copy(), "waiting.drifts": self.drifts.sums.copy()}
-        return super().state() | lazy
+        return PendingArrays.of(super().pending(), lazy)
 
-    def load_state(self, state: dict[str, NDArray[Any]]) -> None:
+    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         super().load_state(state)
         self.drifts.sums = state["waiting.drifts"].copy()
         last = np.repeat(np.array(self.counts, np.uint32)[:, None], self._vectors, axis=1)

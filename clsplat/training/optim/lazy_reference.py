@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -57,14 +58,14 @@ class VisibleReferenceOptimizer(ReferenceOptimizer):
         super().apply(edit)
         self._mark_settled()
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def pending(self) -> dict[str, NDArray[Any]]:
         lazy: dict[str, NDArray[Any]] = {
             "waiting.last": self.last.astype(np.uint32),
             "waiting.drifts": self.drifts.sums.copy(),
         }
-        return super().state() | lazy
+        return super().pending() | lazy
 
-    def load_state(self, state: dict[str, NDArray[Any]]) -> None:
+    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         super().load_state(state)
         self.last, self.drifts.sums = state["waiting.last"].astype(np.int64), state["waiting.drifts"].copy()
 

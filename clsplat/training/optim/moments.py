@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...device.device import Device
 from ...device.opencl import Buffer
+from ...device.pending_arrays import PendingArrays
 from ...rendering.splat_buffers import ParameterBuffers
 from ...splats.fields import Array, Group, Schema
 
@@ -59,13 +61,16 @@ class AdamMoments:
             return {"sh_m": self.first.sh, "sh_v": self.second.sh}
         return {"sh_moments": self.first.sh, "seed_lo": seed & 0xFFFFFFFF, "seed_hi": seed >> 32, "step": step}
 
-    def state(self, n: int, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    def pending(self, n: int, names: tuple[str, ...]) -> PendingArrays:
         """Return the moments of n splats by "first.NAME" and "second.NAME", as 32-bit numbers."""
-        first = self.first.download(n, names)
-        second = self.second.download(n, tuple(name for name in names if name in self.second.schema))
-        if self.half:
-            first["sh"], second["sh"] = unpacked(first["sh"].view(np.uint32))
-        return {f"first.{name}": first[name] for name in names} | {f"second.{name}": second[name] for name in names}
+
+        def read(order: int, name: str) -> Array:
+            if self.half and name == "sh":
+                return unpacked(self.first.download(n, (name,))[name].view(np.uint32))[order]
+            return (self.first, self.second)[order].download(n, (name,))[name]
+
+        orders = enumerate(("first", "second"))
+        return PendingArrays({f"{key}.{name}": partial(read, order, name) for order, key in orders for name in names})
 
     def load_state(self, state: Mapping[str, NDArray[Any]], names: Iterable[str]) -> None:
         """Continue from moments by name."""

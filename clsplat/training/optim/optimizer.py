@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -54,10 +55,16 @@ class Optimizer(Protocol):
     def apply(self, edit: DensifyEdit) -> None:
         """Settle, then move, add, remove and reset splats."""
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Return the state for a checkpoint, without the splats. Both optimizers use the same keys."""
+    def pending(self) -> Mapping[str, NDArray[Any]]:
+        """Return the state for a checkpoint, without the splats. Both optimizers use the same keys.
 
-    def load_state(self, state: dict[str, NDArray[Any]]) -> None:
+        Arrays on the device are read when they are asked for.
+        """
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return the present state, with all arrays in memory."""
+
+    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from `state`. Raise InputError if an entry is missing, unknown, or of another shape."""
 
 
