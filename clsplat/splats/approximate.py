@@ -9,9 +9,9 @@ shows where splats hide each other. Skew-normals get the Gaussian halfway betwee
 splat are nearer on the line but not in images: the low-pass filter widens each of them, and along u they hide each
 other.
 
-*Round profiles* (with an exponent or degrees of freedom) get the Gaussian with the least squared difference on the
-plane. Only the part counts where alpha of an opaque splat is at least 1/255. No Gaussian has a negative opacity, so
-such splats are left out.
+*Round profiles* (with an exponent, degrees of freedom, or the number of a registered shape) get the Gaussian with the
+least squared difference on the plane. Only the part counts where alpha of an opaque splat is at least 1/255. No
+Gaussian has a negative opacity, so such splats are left out.
 
 docs/decisions.md has the measured differences of the images.
 """
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .convert import convert, direct_form, longest_slant, restretched, to_world
 from .fields import DoubleArray, Field
-from .shapes import GAUSSIAN, NORMALISATIONS, SLANT_MAX, Shape, shape_named
+from .shapes import GAUSSIAN, NORMALISATIONS, PACKAGE_SHAPES, SLANT_MAX, Shape, shape_named
 from .splats import Splats
 
 _PEAK = NORMALISATIONS[0]
@@ -36,6 +36,7 @@ _RATIOS = np.linspace(0.0, 1.0, 11)
 _RADII = np.linspace(0.0, 40.0, 1601)
 _PARAMETERS = 100  # nodes of the table over the parameter of a round profile
 _MIN_ALPHA = 1.0 / 255.0
+_SOME = 100  # splats of a registered shape whose profile is looked at
 _STEPS = 60  # limit of Gauss-Newton steps
 _CONVERGED = 1e-9  # Gauss-Newton ends at a smaller step
 _RAW_MAX = 80.0  # the logistic function of a larger raw opacity is 1 in float64
@@ -49,7 +50,8 @@ def nearest_of_shape(splats: Splats, shape: str) -> tuple[Splats, bool]:
 
     Raises
     ------
-    InputError : the shape is unknown, or the normalisation of skew-normals is not "peak".
+    InputError : the shape is unknown, the normalisation of skew-normals is not "peak", a registered shape has a profile
+        that is not round or has several fields, or `shape` has no Gaussians among its kernels.
     """
     try:
         return convert(splats, shape), False
@@ -71,7 +73,8 @@ def nearest_gaussians(splats: Splats) -> Splats:
 
     Raises
     ------
-    InputError : the normalisation of skew-normals is not "peak".
+    InputError : the normalisation of skew-normals is not "peak", or a registered shape has a profile that is not round
+        or has several fields.
     """
     source = shape_named(splats.shape)
     if source.normalised and splats.normalisation != _PEAK:
@@ -85,11 +88,16 @@ def nearest_gaussians(splats: Splats) -> Splats:
         return convert(splats, GAUSSIAN.name)
     except InputError:  # some splats are not Gaussians
         pass
+    if source.name not in PACKAGE_SHAPES:
+        _check_round(splats, source)
     arrays = {field.name: splats.arrays[field.name].copy() for field in GAUSSIAN.schema(splats.sh_degree)}
     changed = np.any(splats.skew != 0.0, axis=1) if source.normalised else np.ones(len(splats), np.bool_)
     model = {name: values[changed].astype(np.float64) for name, values in splats.arrays.items()}
-    parameter = next((field for field in source.fields if field.bounds is not None), None)
-    fitted = _lopsided(model, source) if parameter is None else _round(model, source, parameter)
+    if source.name not in PACKAGE_SHAPES:
+        fitted = _registered(model, source)
+    else:
+        parameter = next((field for field in source.fields if field.bounds is not None), None)
+        fitted = _lopsided(model, source) if parameter is None else _round(model, source, parameter)
     for name, values in fitted.items():
         arrays[name][changed] = values
     return splats.like(GAUSSIAN.name, arrays, _PEAK)
@@ -123,6 +131,40 @@ def _round(model: dict[str, DoubleArray], source: Shape, parameter: Field) -> di
     """Return scale and opacity of the Gaussians nearest to splats with a round profile."""
     values, fits = _round_fits(source, parameter)
     width, height = (np.interp(np.log(model[parameter.name]), np.log(values), column) for column in fits.T)
+    return _resized(model, source, width, height)
+
+
+def _check_round(splats: Splats, source: Shape) -> None:
+    """Raise InputError if a registered shape has several parameters, several opacities or a lopsided profile."""
+    why = ""
+    if len(source.fields) > 1 or any(field.width > 1 for field in source.fields):
+        why = "it has more than one number of its own"
+    else:
+        some = {name: values[:_SOME] for name, values in splats.arrays.items()}
+        ahead, back = (np.asarray(source.profile(sign * _RADII, some), np.float64) for sign in (1.0, -1.0))
+        if ahead.shape[1] > 1 or not np.allclose(ahead, back, atol=1e-6):
+            why = "its profile is not round"
+    if why:
+        raise InputError(f"approximate: the nearest Gaussians of {source.name} are not known, because {why}: keep it")
+
+
+def _registered(model: dict[str, DoubleArray], source: Shape) -> dict[str, DoubleArray]:
+    """Return scale and opacity of the Gaussians nearest to splats of a registered shape with a round profile."""
+    if source.fields:
+        values = model[source.fields[0].name]
+        nodes = np.unique(np.quantile(values, np.linspace(0.0, 1.0, _PARAMETERS)))
+        fields = {source.fields[0].name: nodes}
+    else:
+        values, nodes = np.zeros(len(model["mean"])), np.zeros(1)
+        fields = {"opacity_logit": nodes}
+    fits = _plane_fits(source, fields)
+    width, height = (np.interp(values, nodes, column) for column in fits.T)
+    return _resized(model, source, width, height)
+
+
+def _resized(
+    model: dict[str, DoubleArray], source: Shape, width: DoubleArray, height: DoubleArray
+) -> dict[str, DoubleArray]:
     return {
         "log_scale": model["log_scale"] + np.log(width)[:, None],
         "opacity_logit": _raw(height * source.opacity(model["opacity_logit"])),
@@ -194,8 +236,13 @@ def _round_fits(source: Shape, parameter: Field) -> tuple[DoubleArray, DoubleArr
     """Return values (P,) of the parameter, and width and height (P, 2) of the nearest Gaussian in the plane."""
     assert parameter.bounds is not None
     values = np.geomspace(*parameter.bounds, _PARAMETERS)
-    profiles = np.asarray(source.profile(_RADII, {parameter.name: values})[:, 0], np.float64)
-    return values, _fits(_RADII, profiles, _RADII * (profiles >= _MIN_ALPHA), False)[:, 1:]
+    return values, _plane_fits(source, {parameter.name: values})
+
+
+def _plane_fits(source: Shape, fields: dict[str, DoubleArray]) -> DoubleArray:
+    """Return width and height (P, 2) of the Gaussians nearest to round profiles in the plane."""
+    profiles = np.asarray(source.profile(_RADII, fields)[:, 0], np.float64)
+    return _fits(_RADII, profiles, _RADII * (profiles >= _MIN_ALPHA), False)[:, 1:]
 
 
 def _fits(x: DoubleArray, profiles: DoubleArray, weights: DoubleArray, moves: bool) -> DoubleArray:

@@ -1,8 +1,9 @@
 """Exact conversion of a model to another shape with the same images.
 
 Both forms of the skew-normal describe the same kernels. One has mean and covariance, the other location and scale
-matrix (Azzalini & Capitanio 1999). All other conversions go through the Gaussian, which every shape contains. Student-t
-contains it up to 4e-5 of alpha, at the largest nu.
+matrix (Azzalini & Capitanio 1999). All other conversions go through the Gaussian, which every shape of the package
+contains. Student-t contains it up to 4e-5 of alpha, at the largest nu. Registered shapes contain it only if their
+profile with neutral fields is a Gaussian, and a splat of them is a Gaussian only if all of its fields are neutral.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .checks import LIMIT_SLACK
-from .fields import Array, DoubleArray, scale_of
+from .fields import Array, DoubleArray, Field, scale_of
 from .optical_depth import optical_depth, raw_of_optical_depth
 from .quaternions import of_rotations, rotations
-from .shapes import GAUSSIAN, SKEW_MAX, SKEW_NORMAL, SLANT_MAX, Shape, shape_named
+from .shapes import GAUSSIAN, PACKAGE_SHAPES, SKEW_MAX, SKEW_NORMAL, SLANT_MAX, Shape, shape_named
 from .splats import Splats
 
 ArraysByField = dict[str, DoubleArray]
@@ -167,15 +168,34 @@ def restretched(model: ArraysByField, along: DoubleArray, factor: DoubleArray) -
 def _gaussian(model: ArraysByField, normalisation: str, source: Shape, target: Shape) -> ArraysByField:
     """Return the core fields of splats of `source` that are Gaussians, for splats of `target`."""
     core = {name: model[name] for name in ("mean", "quat", "log_scale", "opacity_logit", "sh")}
+    for shape in (source, target):
+        if not shape.holds_gaussian():
+            raise InputError(
+                f"convert: {source.name} splats have no equal among {target.name} splats, because no "
+                f"{shape.name} splat is a Gaussian: keep {source.name}"
+            )
     if source.signed and not target.signed:
         _refuse(core["opacity_logit"] < 0.0, target, "have a negative opacity", "remove them")
-    for field in ("skew", "opacity_minus_logit", "nu", "beta"):
-        if field in model:
-            core |= _EQUALS[field](model, normalisation, source, target)
+    for field in source.fields:
+        if source.name in PACKAGE_SHAPES and field.name in _EQUALS:
+            core |= _EQUALS[field.name](model, normalisation, source, target)
+        else:
+            _refuse_other_values(model, field, target)
     if source.signed != target.signed:
         raw = core["opacity_logit"]
         core["opacity_logit"] = raw_of_optical_depth(target, optical_depth(source, raw), np.ones_like(raw))
     return core
+
+
+def _refuse_other_values(model: Mapping[str, DoubleArray], field: Field, target: Shape) -> None:
+    """Refuse splats whose values of a field are not the neutral ones, which make the shape a Gaussian."""
+    values = model[field.name].reshape(len(model["mean"]), -1)
+    if field.neutral_from is None:
+        neutral, named = np.array([field.neutral]), ", ".join(f"{value:g}" for value in field.neutral)
+    else:
+        neutral, named = model[field.neutral_from].reshape(len(values), -1), field.neutral_from
+    other = np.any(np.abs(values - neutral) > EQUAL * np.maximum(1.0, np.abs(neutral)), axis=1)
+    _refuse(other, target, f"have {field.name} other than {named}", f"set it to {named}")
 
 
 def _without_skew(model: Mapping[str, DoubleArray], normalisation: str, source: Shape, target: Shape) -> ArraysByField:
@@ -226,4 +246,5 @@ _EQUALS: dict[str, Callable[[Mapping[str, DoubleArray], str, Shape, Shape], Arra
     "opacity_minus_logit": _of_equal_opacities,
     "nu": _of_neutral_nu,
     "beta": _of_beta,
+    "normal": lambda model, normalisation, source, target: {},  # without effect if both opacities are equal
 }

@@ -27,6 +27,8 @@ SLANT_MAX = 10.0  # largest |eta|; its peak is 95 % of the half-Gaussian's
 BETA_BOUNDS = (0.5, 8.0)
 NU_BOUNDS = (1.0, 1e4)  # SSS: Hardtanh(1, 10000)
 NORMALISATIONS = ("peak", "pdf", "none")
+_LINE = np.linspace(-4.0, 4.0, 81)  # where profiles are compared with the Gaussian [standard deviations]
+_GAUSSIAN_TOLERANCE = 1e-4  # the profile of student-t at the largest nu is off by 4e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +74,13 @@ class Shape:
         if self.signed:
             return np.arctanh(opacity)
         return np.log(opacity) - np.log1p(-opacity)
+
+    def holds_gaussian(self) -> bool:
+        """Return whether neutral fields make this kernel a Gaussian, by its profile."""
+        fields = {field.name: np.array([field.neutral]) for field in self.schema(0)}
+        fields = {name: values[:, 0] if values.shape[1] == 1 else values for name, values in fields.items()}
+        alpha = np.asarray(self.profile(_LINE, fields), np.float64).sum(axis=1)
+        return bool(np.abs(alpha - np.exp(-0.5 * _LINE**2)).max() <= _GAUSSIAN_TOLERANCE)
 
     def strength(self, arrays: Mapping[str, Array]) -> NDArray[np.float64]:
         """Return the largest |opacity| of each splat, (N,)."""
@@ -210,6 +219,7 @@ SHAPES = {
         STUDENT_T,
     )
 }
+PACKAGE_SHAPES = frozenset(SHAPES)  # without those of `register_shape`
 DEFAULT_SHAPE = SKEW_NORMAL.name
 PLAIN_SHAPE = GAUSSIAN.name  # the one that the others generalise
 

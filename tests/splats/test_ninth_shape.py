@@ -23,8 +23,10 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.evaluation.chart_style import INK, looks, shape_colour, shape_marker
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
+from clsplat.splats.approximate import nearest_gaussians, nearest_of_shape
+from clsplat.splats.convert import convert
 from clsplat.splats.fields import Array, Field
-from clsplat.splats.shapes import GAUSSIAN, SHAPES, Shape, register_shape
+from clsplat.splats.shapes import BISECTED_SKEW, GAUSSIAN, OPACITY_MINUS, SHAPES, SLANT, Shape, register_shape
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.run import train
@@ -204,3 +206,75 @@ def test_registration_names_what_is_wrong(shape: str, tmp_path: Path, device: De
             Renderer(device).render(Splats("other", arrays()), camera())
     finally:
         del SHAPES["other"]
+
+
+def pinched(values: object) -> Splats:
+    return Splats("pinched", {name: value.astype(np.float32) for name, value in (arrays() | {"pinch": values}).items()})
+
+
+def test_a_parameter_is_never_dropped(shape: str, device: Device) -> None:
+    """Splats with a parameter have no equal Gaussians; without, they have the same images."""
+    some = np.where(np.arange(12) < 5, 0.5, 0.0)
+    with pytest.raises(InputError, match=r"5 of 12 splats have pinch other than 0, which gaussian does not support"):
+        convert(pinched(some), "gaussian")
+    plain, renderer = pinched(np.zeros(12)), Renderer(device, "float64")
+    for target in ("gaussian", "skew-normal-direct", "half-gaussian"):
+        images = [renderer.render(splats, camera()).color for splats in (plain, convert(plain, target))]
+        np.testing.assert_allclose(images[1], images[0], atol=1e-6)
+    assert not convert(convert(plain, "gaussian"), shape).to_numpy()["pinch"].any()
+
+
+def test_its_nearest_gaussians_are_nearer_than_its_core(shape: str, device: Device) -> None:
+    splats, renderer = pinched(arrays()["pinch"]), Renderer(device, "float64")
+    near, differs = nearest_of_shape(splats, "gaussian")
+    assert differs
+    core = Splats("gaussian", {name: value for name, value in splats.to_numpy().items() if name != "pinch"})
+    want, *others = (renderer.render(model, camera()).color for model in (splats, near, core))
+    errors = [np.square(other - want).mean() for other in others]
+    assert errors[0] < 0.1 * errors[1]
+
+
+def cosine(z: Array, fields: dict[str, Array]) -> Array:
+    n = len(next(iter(fields.values())))
+    return np.broadcast_to(np.where(np.abs(z) < 3, 0.5 + 0.5 * np.cos(np.pi * z / 3), 0.0), (n, 1, len(z)))
+
+
+@pytest.fixture
+def strange() -> Iterator[None]:
+    """Shapes that are only converted, never drawn: one without Gaussians, and two with fields of the package."""
+    other = {"record": 10, "moments": 10, "flops": (1, 1)}
+    shapes = [
+        Shape("cosine", GAUSSIAN.source, (), profile=cosine, **other),
+        Shape("slanted", BISECTED_SKEW.source, (SLANT,), profile=GAUSSIAN.profile, **other),
+        Shape("sided", BISECTED_SKEW.source, (OPACITY_MINUS, SLANT), profile=BISECTED_SKEW.profile, **other),
+    ]
+    for added in shapes:
+        register_shape(added)
+    yield
+    for added in shapes:
+        del SHAPES[added.name]
+
+
+def test_a_shape_without_gaussians_has_no_equals(strange: None) -> None:
+    core = {name: value for name, value in arrays().items() if name != "pinch"}
+    without, gaussians = Splats("cosine", core), Splats("gaussian", core)
+    for splats, target in ((without, "gaussian"), (without, "student-t"), (gaussians, "cosine")):
+        with pytest.raises(InputError, match="because no cosine splat is a Gaussian") as caught:
+            convert(splats, target)
+        assert "\n" not in str(caught.value)
+    near = nearest_gaussians(without)
+    assert np.ptp(near.log_scale - without.log_scale) < 1e-9
+    assert 0.0 < float((near.log_scale - without.log_scale)[0, 0]) < 0.5
+    assert [name for name, known in SHAPES.items() if not known.holds_gaussian()] == ["cosine"]
+
+
+def test_fields_of_the_package_have_no_rules_in_other_shapes(strange: None) -> None:
+    core = {name: value for name, value in arrays().items() if name != "pinch"}
+    skew = np.tile([0.0, 0.5, 0.0], (12, 1))
+    with pytest.raises(InputError, match="12 of 12 splats have skew other than 0, 0, 0"):
+        convert(Splats("slanted", core | {"skew": skew}), "gaussian")
+    sides = core | {"skew": 0.0 * skew, "opacity_minus_logit": core["opacity_logit"] + 1.0}
+    with pytest.raises(InputError, match="12 of 12 splats have opacity_minus_logit other than opacity_logit"):
+        convert(Splats("sided", sides), "gaussian")
+    with pytest.raises(InputError, match="nearest Gaussians of slanted are not known, because it has more than one"):
+        nearest_gaussians(Splats("slanted", core | {"skew": skew}))
