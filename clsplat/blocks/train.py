@@ -41,10 +41,10 @@ from ..training.exposure_file import copy_exposures, exposures_beside
 from ..training.folder import ModelFolder, scene_record
 from ..training.initialise import FROM_POINTS
 from ..training.log import Progress
-from ..training.options.density import Adc
 from ..training.stages import StepReports
 from ..training.stored_run import DAMAGE
 from .job import CONTEXT, INSIDE, RUN, START, BlockJob, train_block, train_block_on_worker
+from .options import block_config
 from .partition import Partition, make_partition, surroundings
 from .picture import write_picture
 from .start import with_points
@@ -313,31 +313,3 @@ class _Stages:
         with WorkerPool(self.cluster, self.config.device) as pool:
             work = [Job(name, train_block_on_worker, (job,)) for name, job in zip(names, jobs, strict=True)]
             yield from pool.successes(work)
-
-
-def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
-    """Return the options of a run that goes on from a model: no random points, no penalties, images at full size.
-
-    Parameters
-    ----------
-    config : complete options of the whole training. start : file of the model.
-    """
-    changed = {
-        "strategy": Adc.strategy,
-        "init": str(start),
-        "cap_max": cap,
-        "lr_factor": 1.0,
-        "random_points": 0.0,
-        "opacity_reg": 0.0,
-        "scale_reg": 0.0,
-        "noise_lr": 0.0,
-        "visible_adam": False,
-        "coarse_to_fine": False,
-        "sh_interval": 1,  # the coarse model has all bands
-        "opacity_reset": 0,
-        "bisect_reg": 0.0,
-        "position_optimizer": "adam",
-        "optimizer": "fused",
-        "outlier_check": False,  # of the coarse run
-    }
-    return TrainConfig(**config.to_json() | changed)

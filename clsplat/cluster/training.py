@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ..errors import InputError, OutputError
+from ..errors import InputError, OutputError, Remedy
 from ..files.lock import folder_lock
 from ..files.real_path import real_path
 from ..scenes.scene import Scene
 from ..scenes.source import SceneSource
 from ..splats.splats import Splats
+from ..training.checkpoint import UnusableCheckpoint
 from ..training.config import TrainConfig
 from ..training.folder import ModelFolder
 from ..training.log import Progress
@@ -26,6 +27,8 @@ from .job import Abandoned, JobContext, MissingFiles
 T = TypeVar("T")
 
 MARK = ".clsplat-runs"  # a file in a folder of runs: a worker that does not see it is on a machine without this folder
+
+THIS_STAGE = Remedy("remove this file and resume; other finished runs are kept")
 
 _loaded: list[tuple[Any, Scene]] = []  # the last scene of this process, and its source
 
@@ -67,20 +70,28 @@ def train_in_folder(
     ------
     KeyboardInterrupt : the run was stopped; its checkpoint is saved. Others are those of `train`.
     """
-    resume = holds_run(ModelFolder(folder), config)
-    n_context = 0 if context is None else len(context)
-    model = train(
-        scene,
-        config,
-        progress,
-        output=folder,
-        resume=resume,
-        overwrite=not resume,
-        visit=visit,
-        context=context if n_context else None,
-    )
+    stored = ModelFolder(folder)
+    file, n_context = stored.checkpoint_path, 0 if context is None else len(context)
+    try:
+        resume = holds_run(stored, config)
+        if file.is_file() and not resume and progress is not None:
+            progress(Progress.note(f"{file}: is of a run with other options; it begins anew", config.iterations))
+        model = train(
+            scene,
+            config,
+            progress,
+            output=folder,
+            resume=resume,
+            overwrite=not resume,
+            visit=visit,
+            context=context if n_context else None,
+        )
+    except UnusableCheckpoint as error:
+        raise InputError(f"{file}: {error.message.removeprefix(f'{file}: ')}", THIS_STAGE) from None
     if not model.finished:
         raise KeyboardInterrupt
+    if not stored.ply_path(model.iteration).is_file():  # somebody has removed it since the run ended
+        stored.save(model.splats, model.iteration)
     return {
         "splats": len(model.splats) - n_context,
         "context": n_context,

@@ -15,13 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, Remedy
 from ..files.atomic import atomic_writer
 from ..rendering.splat_buffers import SplatStatistics
 from ..splats.fields import MAX_SH_DEGREE, Array
+from .config import TrainConfig
 
 VERSION = 4
 READABLE = (2, 3, VERSION)  # version 2 has no `reached`, and both have no `average`; `left_out` is optional
+
+
+class UnusableCheckpoint(InputError):
+    """A checkpoint cannot be read, or is not that of the run."""
 
 
 @dataclass(frozen=True)
@@ -104,18 +109,14 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:
-        """Return the checkpoint in a file. Raise InputError if it is missing, damaged or of another version."""
-        try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            meta = json.loads(arrays.pop("meta").tobytes())
-            version = meta["version"]
-        except FileNotFoundError:
-            raise InputError(f"{path}: no checkpoint to resume from: start without --resume") from None
-        except _DAMAGE as error:
-            raise _unreadable(path, "no archive of NumPy" if "pickle" in str(error) else str(error)) from None
-        if version not in READABLE:
-            raise InputError(f"{path}: checkpoint version {str(version)[:20]!r}, this clsplat reads {VERSION}")
+        """Return the checkpoint in a file.
+
+        Raises
+        ------
+        UnusableCheckpoint : it is damaged. InputError : it is missing, or of another version.
+        """
+        arrays = _arrays(path)
+        meta = _meta(path, arrays)
 
         def part(prefix: str) -> dict[str, Any]:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
@@ -140,6 +141,15 @@ class Checkpoint:
         except _DAMAGE as error:
             raise _unreadable(path, str(error)) from None
         return checkpoint
+
+    @staticmethod
+    def options(path: Path) -> dict[str, Any]:
+        """Return all options of the run of a checkpoint, without its arrays. It raises what `load` raises."""
+        meta = _meta(path, _arrays(path, "meta"))
+        try:
+            return TrainConfig.from_json(meta["config"]).to_json()
+        except (*_DAMAGE, InputError) as error:
+            raise _unreadable(path, str(error)) from None
 
     def _check(self) -> None:
         """Raise one of _DAMAGE if `save` cannot have written a value.
@@ -200,7 +210,30 @@ _DAMAGE = (
 )
 
 
-def _unreadable(path: Path, why: str) -> InputError:
-    return InputError(
-        f"{path}: not a readable checkpoint ({why.splitlines()[0] if why else 'damaged'}): start again with --overwrite"
-    )
+def _arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
+    """Return arrays of a file of checkpoints, by default all. It raises what `Checkpoint.load` raises."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in names or stored.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no checkpoint to resume from: start without --resume") from None
+    except _DAMAGE as error:
+        raise _unreadable(path, "no archive of NumPy" if "pickle" in str(error) else str(error)) from None
+
+
+def _meta(path: Path, arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Remove "meta" from the arrays of a checkpoint, and return its values. It raises what `Checkpoint.load` raises."""
+    try:
+        meta = json.loads(arrays.pop("meta").tobytes())
+        version = meta["version"]
+    except _DAMAGE as error:
+        raise _unreadable(path, str(error)) from None
+    if version not in READABLE:
+        raise InputError(f"{path}: checkpoint version {str(version)[:20]!r}, this clsplat reads {VERSION}")
+    known: dict[str, Any] = meta
+    return known
+
+
+def _unreadable(path: Path, why: str) -> UnusableCheckpoint:
+    reason = why.splitlines()[0] if why else "damaged"
+    return UnusableCheckpoint(f"{path}: not a readable checkpoint ({reason})", Remedy("start again", "--overwrite"))

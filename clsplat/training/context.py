@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 
 from ..device.memory import to_device
-from ..errors import InputError
+from ..errors import InputError, Remedy
 from ..rendering.build import KernelBuild
 from ..rendering.splat_buffers import CompactGradients, SplatBuffers
 from ..splats.fields import Array, Group
 from ..splats.low_pass import LOW_PASS
 from ..splats.splats import Splats
-from .checkpoint import Checkpoint
+from .checkpoint import Checkpoint, UnusableCheckpoint
 from .columns import Columns
 from .config import TrainConfig
 from .density.edit import DensifyEdit, Indices
@@ -29,14 +29,15 @@ from .programs import columns_program
 def check_context(context: Splats | None, config: TrainConfig, checkpoint: Checkpoint | None = None) -> None:
     """Raise InputError if a run with these options cannot leave the splats of `context` as they are.
 
-    checkpoint : that the run goes on from; its last splats are those of the same context.
+    checkpoint : that the run goes on from; its last splats must be those of the context, else UnusableCheckpoint.
     """
     if context is None:
         return
     if checkpoint is not None:
         stored = checkpoint.splats["mean"]
         if not np.array_equal(stored[len(stored) - len(context) :], context.mean):
-            raise InputError("the context is not that of the checkpoint: resume with the same one, or start a new run")
+            same = Remedy("resume with the same one, or start a new run")
+            raise UnusableCheckpoint("the context is not that of the checkpoint", same)
     if config.strategy != Adc.strategy or config.optim.optimizer != "fused" or config.optim.visible_adam:
         raise InputError("a context needs the strategy adc and steps of all splats on the device")
     if config.sghmc.position_optimizer != "adam" or config.density.noise_lr:

@@ -11,6 +11,7 @@ from .config import FREE_OPTIONS, TrainConfig
 from .decisions import as_decided
 from .folder import ModelFolder
 from .schedules import RunSchedule, sh_degree_at
+from .stored_run import moved_start
 from .view_sampler import ViewSampler
 
 
@@ -25,7 +26,7 @@ def fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
     checkpoint = Checkpoint.load(folder.checkpoint_path)
     stored = TrainConfig.from_json(checkpoint.config).to_json()
     for key, value in as_decided(config, stored).to_json().items():
-        if key in FREE_OPTIONS or stored[key] == value:
+        if key in FREE_OPTIONS or stored[key] == value or moved_start(folder, key, value, stored[key]):
             continue
         remedy = "use the same options"
         if key == "iterations":

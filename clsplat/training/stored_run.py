@@ -187,11 +187,32 @@ def check_reading(recorded: Mapping[str, Any], reading: Mapping[str, Any], model
 
 
 def holds_run(folder: ModelFolder, config: TrainConfig) -> bool:
-    """Return whether a folder has the checkpoint of a run with these options, which are complete."""
+    """Return whether a folder has the checkpoint of a run with these options, which are complete.
+
+    The checkpoint says it, so that config.json is not needed.
+
+    Raises
+    ------
+    UnusableCheckpoint : the checkpoint is damaged. InputError : it is of another version.
+    """
+    from .checkpoint import Checkpoint  # imported late: it loads OpenCL, which would slow down --help
+
     if not folder.checkpoint_path.is_file():
         return False
-    stored = TrainConfig.from_json(folder.read_config()["config"]).to_json()
-    return all(stored[key] == value for key, value in config.to_json().items() if key not in FREE_OPTIONS)
+    stored = Checkpoint.options(folder.checkpoint_path)
+    options = {key: value for key, value in config.to_json().items() if key not in FREE_OPTIONS}
+    return all(stored[key] == value or moved_start(folder, key, value, stored[key]) for key, value in options.items())
+
+
+def moved_start(folder: ModelFolder, key: str, now: Any, before: Any) -> bool:
+    """Return whether an option of a run is the file of its first splats, which has moved together with its folder.
+
+    The file is beside the folder of the run. Of the path that it had, only the last two names count.
+    """
+    if key != "init":
+        return False
+    file = real_path(Path(now))
+    return file.parent == real_path(folder.path).parent and file.parts[-2:] == Path(before).parts[-2:]
 
 
 def read_options_file(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import pytest
 
 from clsplat.blocks import train as module
 from clsplat.blocks.job import CONTEXT, START, BlockJob
+from clsplat.blocks.options import block_config
 from clsplat.blocks.partition import Partition, make_partition, surroundings
 from clsplat.blocks.state import BlocksOptions, BlocksState
 from clsplat.blocks.targets import BlockTargets
@@ -227,20 +228,7 @@ def test_an_interrupted_training_goes_on(
     finished: BlocksModel, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
     """With the same bits, and without doing finished stages again."""
-    calls = {"coarse": 0, "block": 2, "polish": 3}
-    original, number = module.train_in_folder, iter(range(100))
-
-    def interrupted(*arguments: Any, **named: Any) -> Any:
-        def stop(trainer: Any, event: threading.Event) -> None:
-            if trainer.iteration == 2:
-                event.set()
-
-        if next(number) == calls[moment]:
-            return original(*arguments, **named, visit=stop)
-        return original(*arguments, **named)
-
-    monkeypatch.setattr(module, "train_in_folder", interrupted)
-    monkeypatch.setattr("clsplat.blocks.job.train_in_folder", lambda *a: interrupted(*a[:5]))
+    stop_in_run(monkeypatch, {"coarse": 0, "block": 2, "polish": 3}[moment])
     with pytest.raises(KeyboardInterrupt):
         train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
     monkeypatch.undo()
@@ -268,6 +256,61 @@ def test_the_parts_of_a_block_stay_when_a_training_goes_on(
     assert isinstance(found, BlocksModel)
     assert {file: file.read_bytes() for file in tmp_path.glob("blocks/block_*/*.ply")} in ({}, parts)
     assert found.path.read_bytes() == finished.path.read_bytes()
+
+
+def stop_in_run(patch: pytest.MonkeyPatch, number: int) -> None:
+    """Interrupt a run of a training in its third iteration. number : of the run, 0 for the coarse one."""
+    original, count = module.train_in_folder, iter(range(100))
+
+    def interrupted(*arguments: Any, **named: Any) -> Any:
+        def stop(trainer: Any, event: threading.Event) -> None:
+            if trainer.iteration == 2:
+                event.set()
+
+        return original(*arguments, **named, **({"visit": stop} if next(count) == number else {}))
+
+    patch.setattr(module, "train_in_folder", interrupted)
+    patch.setattr("clsplat.blocks.job.train_in_folder", lambda *a: interrupted(*a[:5]))
+
+
+@pytest.mark.parametrize(
+    ("number", "kept"), [(2, ["20 of 20", "2 of 20"]), (4, ["4 of 4", "2 of 4"])], ids=["block 1", "polish_1"]
+)
+def test_a_folder_may_be_renamed_before_its_training_goes_on(
+    finished: BlocksModel,
+    scene: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    kept: list[str],
+) -> None:
+    """Runs keep what they have done, although the files of their first splats have other paths now."""
+    told: list[str] = []
+    stop_in_run(monkeypatch, number)
+    with pytest.raises(KeyboardInterrupt):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path / "old")
+    monkeypatch.undo()
+    (tmp_path / "old").rename(tmp_path / "new")
+    found = resume(tmp_path / "new", progress=lambda report: told.append(report.message.split(";")[0]))
+    assert isinstance(found, BlocksModel)
+    assert [text for text in told if text.startswith("resumed")] == [f"resumed at iteration {part}" for part in kept]
+    assert not any("block_" in text or "anew" in text for text in told)
+    assert found.path.read_bytes() == finished.path.read_bytes()
+
+
+def test_a_run_with_other_options_does_not_begin_anew_in_silence(
+    finished: BlocksModel, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    stop_in_run(monkeypatch, 2)
+    with pytest.raises(KeyboardInterrupt):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
+    monkeypatch.undo()
+    monkeypatch.setattr(module, "block_config", lambda *a: block_config(*a).replace(lambda_dssim=0.3))
+    train_in_blocks(scene, TWO, CONFIG, lambda at: told.append(at.message), output=tmp_path, resume=True)
+    (first, second) = (text for text in told if "begins anew" in text)
+    assert "block_0/run/checkpoint.npz: is of a run with other options" in first
+    assert "block_1/run" in second
 
 
 @pytest.mark.parametrize("polish", [1, 3])
