@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -23,7 +24,8 @@ from .jobs import UNFINISHED, RunJob, do_run
 from .measure import train_and_measure, warm_up
 from .methods import Method
 from .planned import PlannedRun, do_runs
-from .runs import Run, RunFile, key_digest, refuse_foreign, scene_identity
+from .runs import Run, RunFile, key_digest, refuse_foreign
+from .scene_identity import CONTENT, scene_identity
 from .table import Record, markdown, notes, summarise
 
 TABLE, RESULTS, MODELS = "table.md", "results.json", "models"
@@ -114,10 +116,18 @@ def _missing(
             raise InputError(f"{scene.path}: no test views to measure on: load it with eval")
         identity = scene_identity(scene)
         source = cache(partial(SceneSource.of, scene))
+        warned = False
         for number, (label, undecided, again) in enumerate(configs, 1):
             config = decide(scene, undecided).config
             done = runs.find(identity, label, config, again)
             if done is not None and (not curve or done.get("curve") is not None):
+                if CONTENT not in done["scene"] and not warned:
+                    warned = True
+                    warnings.warn(
+                        f"{runs.path}: an older version wrote runs on {scene.name} without a digest of its photos and "
+                        "test views: if these have changed since, choose another folder",
+                        stacklevel=2,
+                    )
                 continue
             run = Run(scene.name, label, config, number, len(configs), again)
             record: Record = {"scene": identity, "system": label, "config": config.to_json(), "repeat": again}

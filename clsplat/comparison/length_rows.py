@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .scene_identity import scene_title, titled
 from .sweep_rows import ChartRow, chart_point, with_front
-from .table import Record, scene_title, summarise
+from .table import Record, summarise
 
 
 def length_rows(records: Sequence[Record]) -> list[ChartRow]:
@@ -21,7 +22,7 @@ def length_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "seconds", "psnr" [dB] and "ssim". "front":
     whether the point is on the Pareto front of seconds and PSNR in its scene.
     """
-    done = [row for row in summarise(with_shared_seeds(records)) if row["psnr"] is not None]
+    done = [row for row in summarise(with_shared_seeds(titled(records))) if row["psnr"] is not None]
     rows: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in done):
         lengths: dict[tuple[int, str], set[int]] = {}
@@ -47,7 +48,7 @@ def with_shared_seeds(records: Sequence[Record]) -> list[Record]:
     Means over other seeds at each length would differ by the seeds, too.
     """
     groups: dict[tuple[str, str, int], dict[int, set[int]]] = {}
-    keys = [(scene_title(record), record["system"], record["config"]["cap_max"]) for record in records]
+    keys = [(scene_title(record), record["system"], record["config"]["cap_max"]) for record in titled(records)]
     for key, record in zip(keys, records, strict=True):
         config = record["config"]
         groups.setdefault(key, {}).setdefault(config["iterations"], set()).add(config["seed"])

@@ -13,8 +13,8 @@ from typing import Any
 from ..errors import InputError, OutputError
 from ..files.atomic import atomic_writer
 from ..files.file_names import short_name
-from ..scenes.scene import Scene
 from ..training.config import FREE_OPTIONS, TrainConfig
+from .scene_identity import with_contents
 from .table import MEASURED, Record
 
 RUNS = "runs.jsonl"
@@ -86,18 +86,27 @@ class RunFile:
         self._separator = "" if not text or text.endswith("\n") else "\n"
 
     def find(self, scene: Mapping[str, Any], system: str, config: TrainConfig, repeat: int = 0) -> Record | None:
-        """Return the record of a run; None if the run is not finished."""
-        key = run_key({"scene": scene, "system": system, "config": config.to_json(), "repeat": repeat})
-        return next((record for record in self.records if run_key(record) == key), None)
+        """Return the record of a run; None if the run is not finished.
+
+        A row of an older version has no digest of its scene. It is the record of a run if all else is equal, unless
+        the file has another digest for such a scene already (`with_contents`).
+        """
+        place = self._place({"scene": scene, "system": system, "config": config.to_json(), "repeat": repeat})
+        return None if place is None else self.records[place]
+
+    def _place(self, record: Mapping[str, Any]) -> int | None:
+        """Return the index of the record of the same run; None if there is none."""
+        *keys, key = map(run_key, with_contents([*self.records, dict(record)]))
+        return next((place for place, other in enumerate(keys) if other == key), None)
 
     def add(self, record: Record) -> None:
         """Append a record, or replace the record of the same run; raises OutputError if it cannot be written."""
         record = json.loads(json.dumps(record))
-        for place, other in enumerate(self.records):
-            if run_key(other) == run_key(record):
-                self.records[place] = record
-                self._write()
-                return
+        place = self._place(record)
+        if place is not None:
+            self.records[place] = record
+            self._write()
+            return
         try:
             with self.path.open("a", encoding="utf-8") as stream:
                 stream.write(self._separator + json.dumps(record) + "\n")
@@ -166,8 +175,8 @@ def read_runs(path: str | Path) -> list[Record]:
 def distinct(records: Sequence[Record]) -> list[Record]:
     """Return the records without later records of the same run."""
     kept: dict[str, Record] = {}
-    for record in records:
-        kept.setdefault(run_key(record), record)
+    for record, known in zip(records, with_contents(records), strict=True):
+        kept.setdefault(run_key(known), record)
     return list(kept.values())
 
 
@@ -180,15 +189,3 @@ def run_key(record: Mapping[str, Any]) -> str:
 def key_digest(record: Mapping[str, Any]) -> str:
     """Return eight digits that differ between runs with different options, so that no run replaces another."""
     return hashlib.sha256(run_key(record).encode()).hexdigest()[:8]
-
-
-def scene_identity(scene: Scene) -> dict[str, Any]:
-    """Return what identifies a scene as it was read: name, size of the first view, numbers of views."""
-    camera = scene.views[0].camera
-    return {
-        "name": scene.name,
-        "width": camera.width,
-        "height": camera.height,
-        "train": len(scene.train),
-        "test": len(scene.test),
-    }

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from ..files.atomic import atomic_writer
-from .table import Record, scene_title, summarise
+from .scene_identity import scene_title, titled
+from .table import Record, summarise
 
 ChartRow = dict[str, Any]
 
@@ -29,7 +30,7 @@ def curve_rows(records: Sequence[Record]) -> list[ChartRow]:
 
     Each scene has the cap and the iterations with the largest number of measured systems.
     """
-    followed = [record for record in records if record.get("curve") and not record.get("repeat")]
+    followed = [record for record in titled(records) if record.get("curve") and not record.get("repeat")]
     rows: list[ChartRow] = []
     for group in _by_scene(followed).values():
         cap, iterations = _most_frequent(
@@ -225,7 +226,7 @@ def seed_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "cap", "iterations", "system", "shape", "seed", "repeat", "psnr" [dB], "ssim", "digest". Each scene has the
     cap and the iterations with the largest number of such systems.
     """
-    done = [record for record in records if not record["failed"]]
+    done = [record for record in titled(records) if not record["failed"]]
     seeds: dict[tuple[Any, ...], set[int]] = {}
     for record in done:
         seeds.setdefault(_setting(record), set()).add(record["config"]["seed"])
@@ -267,17 +268,17 @@ def write_rows(folder: Path, name: str, rows: Sequence[ChartRow]) -> list[Path]:
 
 
 def _by_scene(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Return the records by scene."""
+    """Return the records, which have titles, by scene."""
     groups: dict[str, list[Record]] = {}
     for record in records:
-        groups.setdefault(json.dumps(record["scene"]), []).append(record)
+        groups.setdefault(scene_title(record), []).append(record)
     return groups
 
 
 def _setting(record: Record) -> tuple[Any, ...]:
     """Return what runs that differ only in the seed have in common."""
     config: Mapping[str, Any] = record["config"]
-    return json.dumps(record["scene"]), record["system"], config["cap_max"], config["iterations"]
+    return scene_title(record), record["system"], config["cap_max"], config["iterations"]
 
 
 def _most_frequent(settings: Sequence[tuple[int, int, str]]) -> tuple[int, int]:

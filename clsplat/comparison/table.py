@@ -7,7 +7,9 @@ import statistics
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
-Record = dict[str, Any]  # a line of runs.jsonl
+from .scene_identity import Record as Record
+from .scene_identity import scene_title as scene_title
+from .scene_identity import titled
 
 HEAD = ("scene", "cap", "iterations", "system", "seeds", "PSNR", "SSIM", "seconds", "splats", "parameters", "MB")
 MEASURED = ("psnr", "ssim", "seconds", "cpu_seconds", "render_ms", "splats", "parameters", "bytes", "device_bytes")
@@ -38,7 +40,7 @@ def summarise(records: Sequence[Record], measured: Sequence[str] = MEASURED) -> 
     {"mean", "half_spread"}, half of maximum less minimum; it is None if every run failed or no run measured it.
     """
     groups: dict[str, list[Record]] = {}
-    for record in records:
+    for record in titled(records):
         if not record.get("repeat"):
             groups.setdefault(group_key(record), []).append(record)
     rows = [_row(group, measured) for group in groups.values()]
@@ -60,7 +62,7 @@ def repeats(records: Sequence[Record]) -> list[Record]:
     splats, bit by bit. "spread" is the maximum less the minimum of the PSNR [dB].
     """
     groups: dict[str, list[Record]] = {}
-    for record in records:
+    for record in titled(records):
         if record.get("digest"):
             where = [record[key] for key in ("device", "driver", "schedule", "version")]
             groups.setdefault(json.dumps([group_key(record), record["config"]["seed"], where]), []).append(record)
@@ -77,12 +79,6 @@ def repeats(records: Sequence[Record]) -> list[Record]:
         for group in groups.values()
         if len(group) > 1
     ]
-
-
-def scene_title(record: Record) -> str:
-    """Return the name and size of a record's scene."""
-    scene = record["scene"]
-    return f"{scene['name']} {scene['width']}x{scene['height']}"
 
 
 def cells(row: Record) -> tuple[str, ...]:

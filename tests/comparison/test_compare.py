@@ -15,7 +15,8 @@ from clsplat.comparison import compare as module
 from clsplat.comparison.compare import compare
 from clsplat.comparison.measure import curve_iterations, digest
 from clsplat.comparison.methods import parse_methods
-from clsplat.comparison.runs import Run, parse_runs, scene_identity
+from clsplat.comparison.runs import Run, parse_runs
+from clsplat.comparison.scene_identity import scene_identity
 from clsplat.comparison.table import HEAD, MEASURED, Record, cells, markdown, notes, repeats, summarise
 from clsplat.errors import InputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate
