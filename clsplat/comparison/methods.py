@@ -72,7 +72,7 @@ def parse_methods(text: str) -> list[Method]:
 
     Raises
     ------
-    InputError : an unknown method or option, a value of another type, or the same method twice.
+    InputError : an unknown method or option, a value of another type, or the same method or option twice.
     """
     groups: list[list[str]] = []
     for part in (part.strip() for part in text.split(",")):
@@ -99,9 +99,14 @@ def _parse_method(name: str, changes: list[str]) -> Method:
     base = name.replace("_", "-")
     if base not in _known_bases():
         raise InputError(f"unknown system {name!r}: choose one of {', '.join(_known_bases())}")
-    values = dict(_parse_change(name, change) for change in changes)
+    pairs = [_parse_change(name, change) for change in changes]
+    keys = [key for key, _ in pairs]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise InputError(f"system {name}: {key} is named twice: name it once")
+    values = dict(pairs)
     texts = [change.partition("=")[2].strip() for change in changes]
-    suffix = ",".join(f"{key}={text}" for key, text in zip(values, texts, strict=False))
+    suffix = ",".join(f"{key}={text}" for key, text in zip(keys, texts, strict=True))
     return Method(f"{base}:{suffix}" if suffix else base, base, values)
 
 

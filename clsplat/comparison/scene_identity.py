@@ -39,7 +39,7 @@ def scene_identity(scene: Scene) -> dict[str, Any]:
 def with_contents(records: Sequence[Record]) -> list[Record]:
     """Return the records with a digest in each scene, as far as one is known.
 
-    A row of an older version does not have one. It counts as a run on the first scene here of the same name, size and numbers.
+    A row of an older version does not have one. It counts as a run on the first scene here with the same numbers.
     """
     first: dict[str, str] = {}
     for record in records:

@@ -52,6 +52,8 @@ def test_common_options_hold_for_all_but_changes_win() -> None:
         ("3dgs:", "'' is not a key=value"),
         ("3dgs:strategy", "'strategy' is not a key=value"),
         ("3dgs:colour=red", "system 3dgs: unknown option 'colour'"),
+        ("gaussian:strategy=mcmc,strategy=adc", "system gaussian: strategy is named twice: name it once"),
+        ("gaussian:opacity-lr=1,init_scale=2,opacity_lr=1", "opacity_lr is named twice"),
         ("3dgs:seed=1", "seed is the same for all systems"),
         ("3dgs:cap-max=1", "cap_max is the same for all"),
         ("3dgs:sh_degree=two", "sh_degree=two: expected a whole number"),
