@@ -207,7 +207,7 @@ def holds_run(folder: ModelFolder, config: TrainConfig) -> bool:
 def moved_start(folder: ModelFolder, key: str, now: Any, before: Any) -> bool:
     """Return whether an option of a run is the file of its first splats, which has moved together with its folder.
 
-    The file is beside the folder of the run. Of the path that it had, only the last two names count.
+    The file is beside the folder of the run. Only the last two names of the path that it had count.
     """
     if key != "init":
         return False
