@@ -79,7 +79,7 @@ class ClusterError(ClsplatError):
 
 def check_choice(name: str, value: str, choices: Collection[str]) -> None:
     """Raise InputError unless an option has one of its values. name : of the option, or of the parameter."""
-    if value not in choices:
+    if value not in tuple(choices):  # a value of any type, also one without a hash
         raise InputError(f"{name} {value!r}: choose one of {', '.join(choices)}")
 
 

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+
+
+def _text(value: object) -> str:
+    """Return a value as one short line."""
+    return " ".join(repr(value).split())[:60]
 
 
 def is_rotation(matrix: NDArray[np.float64]) -> bool:
@@ -27,8 +33,8 @@ class Camera:
 
     Raises
     ------
-    InputError : a size is below 1, a focal length is not above 0, a value is not finite, or the pose is not
-        a rotation and a translation.
+    InputError : a size is not a whole number of at least 1, or a focal length is not above 0. Or a value is not a finite
+        number, or the pose is not a rotation and a translation.
     """
 
     width: int
@@ -42,23 +48,34 @@ class Camera:
     def __init__(
         self, width: int, height: int, fx: float, fy: float, cx: float, cy: float, cam_from_world: ArrayLike
     ) -> None:
-        if int(width) < 1 or int(height) < 1:
+        for name, size in (("width", width), ("height", height)):
+            if isinstance(size, bool) or not isinstance(size, Real) or not float(size).is_integer():
+                raise InputError(f"camera: {name} is {_text(size)}; expected a whole number of pixels")
+        if width < 1 or height < 1:
             raise InputError(f"camera: width x height is {width}x{height}; both must be at least 1")
+        for name, real in (("fx", fx), ("fy", fy), ("cx", cx), ("cy", cy)):
+            if isinstance(real, bool) or np.ndim(real) > 0 or not isinstance(real, Real | np.ndarray):
+                raise InputError(f"camera: {name} is {_text(real)}; expected a number of pixels")
         intrinsics = np.array([fx, fy, cx, cy], dtype=np.float64)
         if not np.all(np.isfinite(intrinsics)) or fx <= 0 or fy <= 0:
             raise InputError(f"camera: fx={fx} fy={fy} cx={cx} cy={cy}; focal lengths must be above 0, all finite")
-        pose = np.array(cam_from_world, dtype=np.float64)
+        try:
+            pose = np.array(cam_from_world, dtype=np.float64)
+        except (TypeError, ValueError):
+            pose = np.zeros(0)
         if pose.shape == (3, 4):
             pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
         if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
             raise InputError("camera: cam_from_world must be a finite (4, 4) or (3, 4) matrix")
         if not is_rotation(pose[:3, :3]):
             raise InputError("camera: cam_from_world's left 3x3 block must be a rotation matrix")
+        if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-3:
+            raise InputError(f"camera: cam_from_world's last row is {pose[3].tolist()}; it must be 0, 0, 0, 1")
         pose.setflags(write=False)
         for name, value in zip(("width", "height"), (width, height), strict=True):
             object.__setattr__(self, name, int(value))
-        for name, real in zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True):
-            object.__setattr__(self, name, float(real))
+        for name, value in zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True):
+            object.__setattr__(self, name, float(value))
         object.__setattr__(self, "cam_from_world", pose)
 
     @property

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
+from ..errors import InputError
+
 _PARTS = re.compile(r"(?P<device>.*)/(?P<count>\d+)")
 
 
@@ -16,7 +18,9 @@ class DeviceSpec(NamedTuple):
 
 
 def device_specs(spec: str | None) -> list[DeviceSpec]:
-    """Return the devices that `spec` lists, without a look at them."""
+    """Return the devices that `spec` lists, without a look at them. Raise InputError if it is not a text."""
+    if not isinstance(spec, str | None):
+        raise InputError(f'device {spec!r}: expected a text such as "cpu", "gpu" or "0:1", or None for the best one')
     found = []
     for one in [None] if spec is None else [part.strip() for part in spec.split(",")]:
         parted = None if one is None else _PARTS.fullmatch(one)

@@ -120,9 +120,11 @@ class Renderer:
 
         Raises
         ------
-        InputError : `background` is not three finite numbers.
+        InputError : `splats` or `camera` is something else, `background` is not three finite numbers, or `sh_degree`
+            is not a whole number of at least 0.
         DeviceError : the device does not have the memory.
         """
+        _check_scene(splats, camera, sh_degree)
         try:
             rgb = np.asarray(background, np.float64)
         except (TypeError, ValueError):
@@ -237,6 +239,19 @@ def read_frame(frame: Frame) -> Rendered:
         raise ValueError("the frame has no depth: build its kernels `for_rendering`")
     alpha = 1 - images.transmittance.read()[..., 0]
     return Rendered(images.color.read(), alpha, images.depth.read()[..., 0])
+
+
+def _check_scene(splats: object, camera: object, sh_degree: object) -> None:
+    """Raise InputError if an argument of `render` has another type than it needs."""
+    if not isinstance(splats, Splats):
+        raise InputError(f"splats is a {type(splats).__name__}: expected Splats: clsplat.Splats.load reads a file")
+    if not isinstance(camera, Camera):
+        remedy = "pass its .camera" if hasattr(camera, "camera") else "make one with clsplat.Camera(...)"
+        raise InputError(f"camera is a {type(camera).__name__}: expected a Camera: {remedy}")
+    if sh_degree is not None and (
+        isinstance(sh_degree, bool) or not isinstance(sh_degree, int | np.integer) or sh_degree < 0
+    ):
+        raise InputError(f"sh_degree {sh_degree!r}: expected a whole number of at least 0, or None for all bands")
 
 
 def _checked(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+import numpy as np
+
 from ..errors import SMALLER_IMAGES, InputError
 from ..files.host_memory import available_bytes
 
@@ -27,6 +29,8 @@ def target_size(width: int, height: int, resolution: int) -> tuple[int, int]:
 
 def check_resolution(resolution: int) -> None:
     """Raise InputError if a resolution is neither a divisor of 3DGS's rule, nor a width, nor -1."""
+    if isinstance(resolution, bool) or not isinstance(resolution, int | np.integer):
+        raise InputError(f"resolution {resolution!r}: expected a whole number: 1, 2, 4, 8, a width in pixels, or -1")
     if resolution != -1 and resolution not in _DIVISORS and resolution < MIN_WIDTH:
         raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width of at least {MIN_WIDTH} pixels, or -1")
 

@@ -50,8 +50,8 @@ def nearest_of_shape(splats: Splats, shape: str) -> tuple[Splats, bool]:
 
     Raises
     ------
-    InputError : the shape is unknown, or has no Gaussians among its kernels. The normalisation of skew-normals is not
-        "peak". A registered shape has several fields, or a profile that is not round.
+    InputError : the shape is unknown, or has no Gaussians among its kernels. Or the normalisation of skew-normals is
+        not "peak". Or a registered shape has several fields, or a profile that is not round.
     """
     try:
         return convert(splats, shape), False

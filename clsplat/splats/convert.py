@@ -2,8 +2,8 @@
 
 Both forms of the skew-normal describe the same kernels. One has mean and covariance, the other location and scale
 matrix (Azzalini & Capitanio 1999). All other conversions go through the Gaussian, which every shape of the package
-contains. Student-t contains it up to 4e-5 of alpha, at the largest nu. A registered shape
-contains it only if its profile with neutral fields is a Gaussian. Then its splats with neutral fields are Gaussians.
+contains. Student-t contains it up to 4e-5 of alpha, at the largest nu. Registered shapes contain it only if their
+profile with neutral fields is a Gaussian. Their splats are Gaussians only if all fields are neutral.
 """
 
 from __future__ import annotations

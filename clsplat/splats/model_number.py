@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ class ModelNumber:
 
     def usable(self, value: float) -> float:
         """Return the value as a float. Raise InputError if it is not above 0 and finite."""
-        if not 0.0 < value < math.inf:
+        if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < value < math.inf:
             raise InputError(f"{self.name.replace('_', ' ')} {value}: give {self.what}")
         return float(value)
 

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field
+from difflib import get_close_matches
 from typing import Any
 
 from ..errors import InputError
@@ -60,7 +61,7 @@ class TrainConfig:
 
     Raises
     ------
-    InputError : a value is out of range. TypeError : an unknown option.
+    InputError : an option is unknown, or a value has another type or is out of range.
     """
 
     shape: str = option(
@@ -169,7 +170,9 @@ class TrainConfig:
     def __init__(self, **options: Any) -> None:
         unknown = [name for name in options if name not in OPTIONS and name not in ("density", *GROUPS)]
         if unknown:
-            raise TypeError(f"TrainConfig has no option {unknown[0]!r}")
+            near = get_close_matches(unknown[0], [*OPTIONS, "density", *GROUPS], n=2)
+            remedy = f"did you mean {' or '.join(near)}?" if near else "see the help of clsplat.TrainConfig"
+            raise InputError(f"TrainConfig has no option {unknown[0]!r}: {remedy}")
         for name in options.keys() & OPTIONS.keys():  # also those that only the other strategy has
             OPTIONS[name].check(options[name])
         values = {name: options.get(name, definition.default) for name, definition in option_table(TrainConfig).items()}

@@ -69,6 +69,8 @@ def train(
     """
     if isinstance(scene, str | os.PathLike):
         raise InputError(f"{scene}: train takes a scene, not its path: clsplat.load_scene reads it")
+    if not isinstance(config, TrainConfig | None):
+        raise InputError(f"config is a {type(config).__name__}: train takes options as clsplat.TrainConfig(...)")
     config = config or TrainConfig()
     folder = None if output is None else ModelFolder(output)
     with nullcontext() if folder is None else folder.for_run(resume=resume, overwrite=overwrite):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -466,3 +467,26 @@ def test_a_background_that_is_no_colour_is_refused(background: Any) -> None:
     splats = Splats.from_points(np.eye(3), np.zeros((3, 3)))
     with pytest.raises(InputError, match="expected three finite numbers R, G, B"):
         Renderer().render(splats, Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4)), background=background)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"splats": "model.ply"}, "splats is a str: expected Splats: clsplat.Splats.load reads a file"),
+        ({"camera": None}, "camera is a NoneType: expected a Camera: make one"),
+        ({"camera": SimpleNamespace(camera=1)}, "camera is a SimpleNamespace: expected a Camera: pass its .camera"),
+        ({"sh_degree": -1}, "sh_degree -1: expected a whole number of at least 0"),
+        ({"sh_degree": 1.5}, "sh_degree 1.5: expected"),
+        ({"sh_degree": "1"}, "sh_degree '1': expected"),
+    ],
+)
+def test_an_argument_of_another_type_is_refused(make_renderer, device, change, message) -> None:
+    arguments = {"splats": Splats("gaussian", for_shape(random_splats(7, 3, 0), "gaussian"))}
+    arguments["camera"] = random_camera(7, 5, 4)
+    with pytest.raises(InputError, match=message):
+        make_renderer(device).render(**arguments | change)
+
+
+def test_a_device_is_a_text() -> None:
+    with pytest.raises(InputError, match="device 3: expected a text such as"):
+        Renderer(3)

@@ -10,7 +10,7 @@ from small_scene import HEIGHT, N_VIEWS, WIDTH, write_garden
 
 from clsplat.errors import InputError
 from clsplat.scenes import photo_size, read_view
-from clsplat.scenes.photo_size import check_memory
+from clsplat.scenes.photo_size import check_memory, check_resolution
 
 
 @pytest.mark.parametrize(("command", "kept"), [("train", N_VIEWS), ("compare", N_VIEWS - 2)])
@@ -33,3 +33,9 @@ def test_the_estimate_counts_kept_and_decoded_photos(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(photo_size, "available_bytes", lambda: needed - 1)
     with pytest.raises(InputError, match=rf"scene: 10 photos of {WIDTH // 2}x{HEIGHT // 2} px need at least 0 MB"):
         check_memory("scene", sizes, 2)
+
+
+@pytest.mark.parametrize("resolution", ["a", 2.0, None, True])
+def test_a_resolution_is_a_whole_number(resolution: object) -> None:
+    with pytest.raises(InputError, match=f"resolution {resolution!r}: expected a whole number: 1, 2, 4, 8"):
+        check_resolution(resolution)  # type: ignore[arg-type]

@@ -223,3 +223,9 @@ def test_first_scales_follow_the_units_of_the_scene() -> None:
     colours = np.full((60, 3), 0.5)
     normal, small = (Splats.from_points(points * unit, colours, sh_degree=0) for unit in (1.0, 1e-5))
     np.testing.assert_allclose(small.log_scale, normal.log_scale + np.log(1e-5), rtol=1e-5)
+
+
+def test_a_low_pass_is_a_number() -> None:
+    arrays = random_arrays("gaussian", 3, 0, 1)
+    with pytest.raises(InputError, match="low pass a: give a variance"):
+        Splats("gaussian", arrays, low_pass="a")  # type: ignore[arg-type]

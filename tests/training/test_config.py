@@ -8,6 +8,7 @@ import importlib
 import json
 from typing import Any
 
+import numpy as np
 import pytest
 
 from clsplat.errors import InputError
@@ -23,8 +24,34 @@ def test_groups_and_flat_options_make_the_same_config() -> None:
     assert (grouped.strategy, grouped.density.init_opacity) == ("mcmc", Mcmc().init_opacity)
     assert grouped.replace(opacity_lr=0.05) == TrainConfig(cap_max=7, density=Mcmc(growth=1.1))
     assert dataclasses.replace(grouped, density=Adc()) == TrainConfig(cap_max=7, opacity_lr=0.1)
-    with pytest.raises(TypeError, match="no option 'colour'"):
-        TrainConfig(colour=1)
+    with pytest.raises(InputError, match="no option 'iteration': did you mean iterations"):
+        TrainConfig(iteration=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("iterations", 10.5, "iterations is 10.5; expected a whole number"),
+        ("iterations", True, "iterations is true; expected a whole number"),
+        ("opacity_lr", None, "opacity_lr is null; expected a finite number"),
+        ("background", "red", "background is the text 'red'; expected a list of numbers"),
+        ("background", 5, "background is 5; expected a list of numbers"),
+        ("init", 5, "init is 5; expected a text"),
+        ("device", 5, "device is 5; expected a text, or null"),
+        ("test_iterations", 5, "test_iterations is 5; expected a list of numbers"),
+        ("shape", [], r"shape \[\]: choose one of gaussian"),
+    ],
+)
+def test_a_value_of_another_type_is_refused(name: str, value: object, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        TrainConfig(**{name: value})
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_and_lists_of_numpy_are_values() -> None:
+    config = TrainConfig(iterations=np.int64(10), opacity_lr=np.float32(0.5), background=[0.0, 0.5, 1])
+    assert (config.iterations, config.optim.opacity_lr, config.background[1]) == (10, 0.5, 0.5)
+    assert len(TrainConfig(background=np.zeros(3)).background) == 3
 
 
 def test_every_option_is_in_one_group_and_has_help() -> None:

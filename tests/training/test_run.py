@@ -265,3 +265,8 @@ def test_splats_that_are_not_finite_are_mended_or_left_out(
 def test_the_path_of_a_scene_is_not_a_scene(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"train takes a scene, not its path: clsplat\.load_scene reads it"):
         train(str(tmp_path))  # type: ignore[arg-type]
+
+
+def test_a_dictionary_is_not_a_config(scene: Scene) -> None:
+    with pytest.raises(InputError, match=r"config is a dict: train takes options as clsplat\.TrainConfig"):
+        train(scene, {"iterations": 5})  # type: ignore[arg-type]

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from ...errors import InputError, check_choice
 from ...files.json_file import describe, to_real
 
@@ -88,18 +90,14 @@ class Option:
         return self.type
 
     def check(self, value: Any) -> None:
-        """Raise InputError if a value is not one of the choices, not finite, or out of range."""
+        """Raise InputError if a value is not one of the choices, not finite, of another type, or out of range."""
         if self.choices:
             check_choice(self.name, value, self.choices)
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(f"{self.name} {value}: must be finite{f' and {self.range}' if self.range else ''}")
-        if self.range is None or value is None:
-            return
-        try:
-            is_allowed = self.range.allows(value)
-        except TypeError:
-            raise InputError(f"{self.name} is {describe(value)}; expected {_expected(self.type)}") from None
-        if not is_allowed:
+        if not _fits(value, self.type):
+            raise InputError(f"{self.name} is {_described(value)}; expected {_expected(self.type)}")
+        if self.range is not None and value is not None and not self.range.allows(value):
             raise InputError(f"{self.name} {value}: must be {self.range}")
 
     def from_json(self, value: Any) -> Any:
@@ -111,7 +109,7 @@ class Option:
         """
         converted = tuple(value) if isinstance(value, list) else value
         if not _is_instance(converted, self.type):
-            raise InputError(f"config: {self.name} is {describe(value)}; expected {_expected(self.type)}")
+            raise InputError(f"config: {self.name} is {_described(value)}; expected {_expected(self.type)}")
         return converted
 
 
@@ -193,6 +191,28 @@ def _is_instance(value: Any, hint: Any) -> bool:
     return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
 
 
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value of a Python program has a type: NumPy's numbers, lists and arrays have it, too."""
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(hint, UnionType):
+        return any(_fits(value, part) for part in get_args(hint))
+    if get_origin(hint) is tuple:
+        return isinstance(value, tuple | list) and all(_fits(part, get_args(hint)[0]) for part in value)
+    return to_real(value) is not None if hint is float else _is_instance(value, hint)  # `check` has refused NaN
+
+
+def _described(value: Any) -> str:
+    """Describe a value in a few words, a number by its digits."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return f"{value}"
+    if value is None or isinstance(value, bool | str | list | dict):
+        return describe(value)
+    return f"a {type(value).__name__}"
+
+
 def _expected(hint: Any) -> str:
+    if isinstance(hint, UnionType):
+        return f"{' or '.join(_expected(part) for part in get_args(hint) if part is not NoneType)}, or null"
     names = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a text"}
-    return names.get(hint, "a list of numbers" if get_origin(hint) is tuple else "another kind of value, or null")
+    return names.get(hint, "a list of numbers" if get_origin(hint) is tuple else "another kind of value")
