@@ -33,8 +33,8 @@ class Camera:
 
     Raises
     ------
-    InputError : a size is not a whole number of at least 1, or a focal length is not above 0. Or a value is not a finite
-        number, or the pose is not a rotation and a translation.
+    InputError : a size is not a whole number of at least 1, or a focal length is not above 0. Or a value is not
+        a finite number, or the pose is not a rotation and a translation.
     """
 
     width: int

@@ -88,13 +88,13 @@ def nearest_gaussians(splats: Splats) -> Splats:
         return convert(splats, GAUSSIAN.name)
     except InputError:  # some splats are not Gaussians
         pass
-    if source.name not in PACKAGE_SHAPES:
+    if not _is_known(source):
         _check_round(splats, source)
     arrays = {field.name: splats.arrays[field.name].copy() for field in GAUSSIAN.schema(splats.sh_degree)}
     changed = np.any(splats.skew != 0.0, axis=1) if source.normalised else np.ones(len(splats), np.bool_)
     model = {name: values[changed].astype(np.float64) for name, values in splats.arrays.items()}
-    if source.name not in PACKAGE_SHAPES:
-        fitted = _registered(model, source)
+    if not _is_known(source):
+        fitted = _by_profile(model, source)
     else:
         parameter = next((field for field in source.fields if field.bounds is not None), None)
         fitted = _lopsided(model, source) if parameter is None else _round(model, source, parameter)
@@ -134,8 +134,14 @@ def _round(model: dict[str, DoubleArray], source: Shape, parameter: Field) -> di
     return _resized(model, source, width, height)
 
 
+def _is_known(source: Shape) -> bool:
+    """Return whether it is a shape of the package with a skew, a plane, or a number with bounds."""
+    described = source.skew_form or any(field.name == "normal" or field.bounds for field in source.fields)
+    return source.name in PACKAGE_SHAPES and bool(described)
+
+
 def _check_round(splats: Splats, source: Shape) -> None:
-    """Raise InputError if a registered shape has several parameters, several opacities or a lopsided profile."""
+    """Raise InputError if another shape has several parameters, several opacities or a lopsided profile."""
     why = ""
     if len(source.fields) > 1 or any(field.width > 1 for field in source.fields):
         why = "it has more than one number of its own"
@@ -148,8 +154,8 @@ def _check_round(splats: Splats, source: Shape) -> None:
         raise InputError(f"approximate: the nearest Gaussians of {source.name} are not known, because {why}: keep it")
 
 
-def _registered(model: dict[str, DoubleArray], source: Shape) -> dict[str, DoubleArray]:
-    """Return scale and opacity of the Gaussians nearest to splats of a registered shape with a round profile."""
+def _by_profile(model: dict[str, DoubleArray], source: Shape) -> dict[str, DoubleArray]:
+    """Return scale and opacity of the Gaussians nearest to splats with a round profile of at most one number."""
     if source.fields:
         values = model[source.fields[0].name]
         nodes = np.unique(np.quantile(values, np.linspace(0.0, 1.0, _PARAMETERS)))

@@ -262,6 +262,30 @@ def test_the_drawing_is_up_to_date() -> None:
     assert draw_imports.DRAWING.read_text() == draw_imports.draw(), "run: python docs/draw_imports.py"
 
 
+def test_the_steps_to_a_shape_name_what_exists() -> None:
+    """Each "`NAME` of `file`" of the steps is in the file, and the page of the kernels leads to them."""
+    steps = TEXTS["CONTRIBUTING.md"].split("## How to add a shape")[1].split("## How to add a camera")[0]
+    named = re.findall(r"`(\w+)`\s+of\s+`((?:tests|clsplat)/[\w/]+\.py)`", steps)
+    assert {"RADIAL", "SKEWED", "OWN"} <= {name for name, file in named}
+    for name, file in named:
+        assert re.search(rf"\b{name}\b", (ROOT / file).read_text()), f"{file} has no {name}"
+    assert "random_splats` in" not in steps
+    assert "#how-to-add-a-shape" in TEXTS["docs/kernels.md"]
+
+
+def test_the_page_of_the_kernels_names_what_is_projected() -> None:
+    moved = {path.stem for path in (ROOT / "cl/shape").glob("*.clh") if "#define SHAPE_CENTRE" in path.read_text()}
+    assert moved == {"skew_normal_direct"}
+    assert "In `skew-normal-direct` the *centroid*" in TEXTS["docs/kernels.md"]
+    assert "In `bisected-skew` and `half-gaussian` the location (x, y, z) itself" in TEXTS["docs/kernels.md"]
+
+
+def test_figures_of_other_systems_are_those_of_the_benchmark() -> None:
+    published = tomllib.loads((ROOT / "clsplat/benchmark/sets/nerf-synthetic.toml").read_text())["published"]
+    figures = [row["psnr"]["lego"] for row in published if row["system"] == "metal-gauss" and len(row["psnr"]) > 1]
+    assert f"{figures[0]} dB in its table of all scenes" in " ".join(TEXTS["README.md"].split())
+
+
 def test_links_work() -> None:
     for page, text in TEXTS.items():
         for target in re.findall(r"\]\(([^)#\s]*)(?:#[^)]*)?\)", text):

@@ -23,6 +23,7 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.evaluation.chart_style import INK, looks, shape_colour, shape_marker
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
+from clsplat.splats import approximate
 from clsplat.splats.approximate import nearest_gaussians, nearest_of_shape
 from clsplat.splats.convert import convert
 from clsplat.splats.fields import Array, Field
@@ -266,6 +267,15 @@ def test_a_shape_without_gaussians_has_no_equals(strange: None) -> None:
     assert np.ptp(near.log_scale - without.log_scale) < 1e-9
     assert 0.0 < float((near.log_scale - without.log_scale)[0, 0]) < 0.5
     assert [name for name, known in SHAPES.items() if not known.holds_gaussian()] == ["cosine"]
+
+
+def test_a_new_shape_of_the_package_without_bounds_has_nearest_gaussians(
+    strange: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    splats = Splats("cosine", {name: value for name, value in arrays().items() if name != "pinch"})
+    want = nearest_gaussians(splats)
+    monkeypatch.setattr(approximate, "PACKAGE_SHAPES", frozenset(SHAPES))
+    np.testing.assert_array_equal(nearest_gaussians(splats).log_scale, want.log_scale)
 
 
 def test_fields_of_the_package_have_no_rules_in_other_shapes(strange: None) -> None:
