@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .scene_identity import scene_title, titled
-from .sweep_rows import ChartRow, chart_point, with_front
+from .sweep_rows import ChartRow, chart_point, has_place, with_front
 from .table import Record, summarise
 
 
@@ -22,7 +22,7 @@ def length_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "seconds", "psnr" [dB] and "ssim". "front":
     whether the point is on the Pareto front of seconds and PSNR in its scene.
     """
-    done = [row for row in summarise(with_shared_seeds(titled(records))) if row["psnr"] is not None]
+    done = [row for row in summarise(with_shared_seeds(titled(records))) if has_place(row)]
     rows: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in done):
         lengths: dict[tuple[int, str], set[int]] = {}

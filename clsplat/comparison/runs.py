@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,26 +15,12 @@ from ..errors import InputError, OutputError
 from ..files.atomic import atomic_writer
 from ..files.file_names import short_name
 from ..training.config import FREE_OPTIONS, TrainConfig
+from .run_rows import parse_runs, torn_tail
 from .scene_identity import with_contents
-from .table import MEASURED, Record
+from .table import Record
 
 RUNS = "runs.jsonl"
 _LONGEST_NAME = 200  # of a run's files, without digits and a suffix [bytes]; most file systems allow 255
-# Keys that every line must have.
-_KEYS = {
-    "scene",
-    "system",
-    "config",
-    "failed",
-    "finite",
-    "cap_held",
-    "device",
-    "driver",
-    "schedule",
-    "version",
-    "protocol",
-    *MEASURED,
-}
 
 
 @dataclass(frozen=True)
@@ -69,7 +56,7 @@ class RunFile:
 
     Raises
     ------
-    OutputError : the folder or the file cannot be used.
+    OutputError : the folder or the file cannot be used. InputError : a row of the file is damaged (`parse_runs`).
     """
 
     def __init__(self, folder: Path) -> None:
@@ -78,11 +65,14 @@ class RunFile:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if self.path.exists():
-                text = self.path.read_text(encoding="utf-8")
+                text = self.path.read_bytes().decode()
         except (OSError, UnicodeDecodeError) as error:
             reason = getattr(error, "strerror", None) or error
             raise OutputError(f"{self.path}: cannot be used ({reason}): choose another folder") from None
-        self.records = parse_runs(text)
+        self.records = parse_runs(text, self.path)
+        whole = text.removesuffix(torn_tail(text))
+        self._end = len(whole.encode()) if whole != text else None  # of the whole lines [bytes], before a torn one
+        text = whole
         self._separator = "" if not text or text.endswith("\n") else "\n"
 
     def find(self, scene: Mapping[str, Any], system: str, config: TrainConfig, repeat: int = 0) -> Record | None:
@@ -108,11 +98,13 @@ class RunFile:
             self._write()
             return
         try:
+            if self._end is not None:
+                os.truncate(self.path, self._end)
             with self.path.open("a", encoding="utf-8") as stream:
                 stream.write(self._separator + json.dumps(record) + "\n")
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written ({error.strerror or error}): free some space") from None
-        self._separator = ""
+        self._separator, self._end = "", None
         self.records.append(record)
 
     def arrange(self, order: Sequence[Mapping[str, Any]]) -> None:
@@ -126,7 +118,7 @@ class RunFile:
     def _write(self) -> None:
         with atomic_writer(self.path) as whole:
             whole.write("".join(json.dumps(line) + "\n" for line in self.records).encode())
-        self._separator = ""
+        self._separator, self._end = "", None
 
 
 def refuse_foreign(folder: Path, names: Sequence[str]) -> None:
@@ -143,33 +135,21 @@ def refuse_foreign(folder: Path, names: Sequence[str]) -> None:
                 raise OutputError(f"{path}: exists already, but no {RUNS} beside it: choose another folder")
 
 
-def parse_runs(text: str) -> list[Record]:
-    """Return the records of a runs.jsonl. A line that a crash cut short is left out, so that its run is repeated."""
-    records = []
-    for line in text.splitlines():
-        try:
-            record = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(record, dict) and record.keys() >= _KEYS:
-            records.append(record)
-    return records
-
-
 def read_runs(path: str | Path) -> list[Record]:
     """Return the records of a runs.jsonl, or of the one in a folder.
 
     Raises
     ------
-    InputError : the file is missing or cannot be read.
+    InputError : the file is missing or cannot be read, or a row is damaged (`parse_runs`).
     """
     file = Path(path)
     file = file / RUNS if file.is_dir() else file
     try:
-        return parse_runs(file.read_text(encoding="utf-8"))
+        text = file.read_bytes().decode()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{file}: cannot be read ({reason}): give the folder of a comparison, or its {RUNS}") from None
+    return parse_runs(text, file)
 
 
 def distinct(records: Sequence[Record]) -> list[Record]:

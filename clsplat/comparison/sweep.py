@@ -128,7 +128,10 @@ def sweep(
             on_run=on_run,
         )
     finally:
-        if (Path(output) / RUNS).exists() and (records := [*read_runs(output), *more]):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the comparison has read the file before, and has shown them
+            records = [*read_runs(output), *more] if (Path(output) / RUNS).exists() else []
+        if records:
             with folder_lock(Path(output)):
                 write_report(output, records, reference=methods[0].label)
 

@@ -47,7 +47,8 @@ def curve_rows(records: Sequence[Record]) -> list[ChartRow]:
             }
             for record in group
             for point in record["curve"]
-            if (record["config"]["cap_max"], record["config"]["iterations"]) == (cap, iterations)
+            if math.isfinite(point["psnr"])
+            and (record["config"]["cap_max"], record["config"]["iterations"]) == (cap, iterations)
         ]
     return rows
 
@@ -64,7 +65,7 @@ def point_rows(records: Sequence[Record]) -> list[ChartRow]:
     Pareto front of its scene.
     """
     measured = ("psnr", "ssim", "seconds", "parameters", *COSTS)
-    rows = [chart_point(row, measured) for row in summarise(records) if row["psnr"] is not None]
+    rows = [chart_point(row, measured) for row in summarise(records) if has_place(row)]
     kept: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         group = [row for row in rows if row["scene"] == scene]
@@ -77,6 +78,14 @@ def point_rows(records: Sequence[Record]) -> list[ChartRow]:
             group = with_front(group, cost, f"front_{cost}")
         kept += group
     return kept
+
+
+def has_place(row: Record) -> bool:
+    """Return whether a row of `table.summarise` has a place in a chart: not if no run measured a finite PSNR.
+
+    The PSNR of equal images is infinite.
+    """
+    return row["psnr"] is not None and math.isfinite(row["psnr"]["mean"])
 
 
 def chart_point(row: Record, measured: Sequence[str]) -> ChartRow:
@@ -226,7 +235,7 @@ def seed_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "cap", "iterations", "system", "shape", "seed", "repeat", "psnr" [dB], "ssim", "digest". Each scene has the
     cap and the iterations with the largest number of such systems.
     """
-    done = [record for record in titled(records) if not record["failed"]]
+    done = [record for record in titled(records) if not record["failed"] and math.isfinite(record["psnr"])]
     seeds: dict[tuple[Any, ...], set[int]] = {}
     for record in done:
         seeds.setdefault(_setting(record), set()).add(record["config"]["seed"])

@@ -15,7 +15,7 @@ from clsplat.comparison import compare as module
 from clsplat.comparison.compare import compare
 from clsplat.comparison.measure import curve_iterations, digest
 from clsplat.comparison.methods import parse_methods
-from clsplat.comparison.runs import Run, parse_runs
+from clsplat.comparison.runs import Run
 from clsplat.comparison.scene_identity import scene_identity
 from clsplat.comparison.table import HEAD, MEASURED, Record, cells, markdown, notes, repeats, summarise
 from clsplat.errors import InputError, TrainingError
@@ -209,12 +209,6 @@ def test_repeats_are_the_same_bits(scene: Scene, tmp_path: Path) -> None:
     assert row["seeds"] == [0, 1], "repeats do not count in the mean"
     assert "repeated: 1 of 1 runs gave the same splats each time, bit by bit" in notes(records, [row])
     assert len(compare([scene], parse_methods("gaussian"), tmp_path, [CAP], [0, 1], SHORT, repeat=2)) == 3
-
-
-def test_lines_that_are_damaged_are_left_out() -> None:
-    record = recorded(TrainConfig(), "a")
-    whole = json.dumps(record)
-    assert parse_runs("\n".join([whole, whole[:40], "[" * 100_000, "7"])) == [json.loads(whole)]
 
 
 def test_repeats_that_differ_are_told() -> None:
