@@ -141,6 +141,9 @@ def options_and_scenes(
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two scenes are called {name}: rename one of the folders")
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder: check its name")
     background = common.get("background", BLACK)
     return common, (load_recorded_scene(path, reading, background) for path in paths)
 

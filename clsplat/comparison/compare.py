@@ -18,12 +18,12 @@ from ..files.real_path import real_path
 from ..scenes.scene import Scene
 from ..scenes.source import SceneSource
 from ..training.config import TrainConfig
-from ..training.decisions import decide
 from ..training.log import Progress
 from .jobs import UNFINISHED, RunJob, do_run
 from .measure import train_and_measure, warm_up
 from .methods import Method
 from .planned import PlannedRun, do_runs
+from .run_options import decided_config, unused_changes
 from .runs import Run, RunFile, key_digest, refuse_foreign
 from .scene_identity import CONTENT, scene_identity
 from .table import Record, markdown, notes, summarise
@@ -66,13 +66,18 @@ def compare(
         cut short go on from their checkpoints in `output`/unfinished, if all workers see that folder.
     progress : as of `train`. on_run : called with (run, None) before each run and (run, record) after it.
 
+    Warns
+    -----
+    UserWarning : a change of a method has no effect in any of its runs, or rows in `output` are of an older version.
+
     Returns
     -------
     All runs in `output`, in the order of their training; `table.summarise` makes the rows of the table.
 
     Raises
     ------
-    InputError : a scene has no test views, or options do not fit a method.
+    InputError : a scene has no test views, options do not fit a method, or a row of `output` is damaged. Options are
+        checked before the first run on each scene.
     OutputError : `output` cannot be written, holds files that no comparison wrote, or another comparison writes there.
     DeviceError : no device, or not enough memory.
     ClusterError : with `cluster`: no scheduler answers, or it is gone.
@@ -93,7 +98,7 @@ def compare(
     runs = RunFile(folder)
     with folder_lock(folder):
         try:
-            plan = _missing(scenes, configs, runs, folder, save_models, curve, progress)
+            plan = _missing(scenes, methods, configs, runs, folder, save_models, curve, progress)
             do_runs(plan, runs, folder / UNFINISHED, cluster, on_run, extra)
         finally:
             write_table(folder, runs.records)
@@ -102,6 +107,7 @@ def compare(
 
 def _missing(
     scenes: Iterable[Scene],
+    methods: Sequence[Method],
     configs: Sequence[tuple[str, TrainConfig, int]],
     runs: RunFile,
     folder: Path,
@@ -111,14 +117,19 @@ def _missing(
 ) -> Iterator[PlannedRun]:
     """Yield the runs that are not finished, in their order. configs : label, undecided options and number of repeat."""
     warm: set[str] = set()
+    shown: set[str] = set()
     for scene in scenes:
         if not scene.test:
             raise InputError(f"{scene.path}: no test views to measure on: load it with eval")
         identity = scene_identity(scene)
         source = cache(partial(SceneSource.of, scene))
+        decided = [decided_config(label, undecided, scene) for label, undecided, _ in configs]
+        for message in unused_changes(methods, [label for label, *_ in configs], decided, scene):
+            if message not in shown:
+                shown.add(message)
+                warnings.warn(message, stacklevel=2)
         warned = False
-        for number, (label, undecided, again) in enumerate(configs, 1):
-            config = decide(scene, undecided).config
+        for number, ((label, _, again), config) in enumerate(zip(configs, decided, strict=True), 1):
             done = runs.find(identity, label, config, again)
             if done is not None and (not curve or done.get("curve") is not None):
                 if CONTENT not in done["scene"] and not warned:

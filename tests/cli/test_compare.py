@@ -15,7 +15,7 @@ TINY = ["--iterations", "12", "--sh-degree", "1", "--densify-interval", "5"]
 
 def test_compare_prints_a_table_and_continues(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    arguments = ("compare", scene, "-o", out, "--systems", "gaussian,default:dense_size=0.02", "--cap-max", "40", *TINY)
+    arguments = ("compare", scene, "-o", out, "--systems", "gaussian,default:opacity_lr=0.02", "--cap-max", "40", *TINY)
     first = run(*arguments, "--seeds", "0", "1")
     assert first.exit_code == 0, first.output
     lines = first.stdout.splitlines()
@@ -32,9 +32,9 @@ def test_compare_prints_a_table_and_continues(scene: Path, tmp_path: Path) -> No
         "parameters",
         "MB",
     ]
-    assert [line.split()[4] for line in lines[1:3]] == ["gaussian", "default:dense_size=0.02"]
+    assert [line.split()[4] for line in lines[1:3]] == ["gaussian", "default:opacity_lr=0.02"]
     assert "±" in lines[1]
-    assert "[4/4] yard default:dense_size=0.02 cap 40 seed 1: PSNR" in first.stderr
+    assert "[4/4] yard default:opacity_lr=0.02 cap 40 seed 1: PSNR" in first.stderr
     assert {path.name for path in out.iterdir()} == {"runs.jsonl", "table.md", "results.json"}
     assert len((out / "runs.jsonl").read_text().splitlines()) == 4
     again = run(*arguments, "--seeds", "0,1")
@@ -42,7 +42,7 @@ def test_compare_prints_a_table_and_continues(scene: Path, tmp_path: Path) -> No
     assert clsplat(*arguments, "--seeds", "2", "-q") == ""
     rows = json.loads((out / "results.json").read_text())["rows"]
     assert [row["seeds"] for row in rows] == [[0, 1, 2]] * 2
-    assert rows[1]["config"]["dense_size"] == 0.02
+    assert rows[1]["config"]["opacity_lr"] == 0.02
     assert rows[0]["config"]["iterations"] == 12
 
 

@@ -152,7 +152,7 @@ def test_each_length_is_run_for_all_systems(scene: Scene, counted: list[Any], tm
 
 
 def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
-    systems = parse_methods("gaussian,default,gaussian:dense_size=0.02")
+    systems = parse_methods("gaussian,default,gaussian:opacity_lr=0.02")
 
     def interrupt(run: Run, record: Record | None) -> None:
         if run.number == 3:
@@ -167,7 +167,7 @@ def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp
     (tmp_path / "runs.jsonl").write_text(whole[:-20])
     records = compare([scene], systems, tmp_path, [CAP], [0], SHORT)
     assert len(counted) == 4
-    assert [record["system"] for record in records] == ["gaussian", "default", "gaussian:dense_size=0.02"]
+    assert [record["system"] for record in records] == ["gaussian", "default", "gaussian:opacity_lr=0.02"]
     compare([scene], systems, tmp_path, [CAP], [0], SHORT)
     assert len(counted) == 4
 
@@ -244,18 +244,18 @@ def test_failed_runs_are_told_and_the_comparison_goes_on(
     run = Trainer.run
 
     def fail(self: Trainer) -> object:
-        if self.config.density.dense_size == 2:
+        if self.config.density.init_opacity == 0.3:
             raise TrainingError("iteration 7: the loss is not finite")
         return run(self)
 
     monkeypatch.setattr(Trainer, "run", fail)
-    records = compare([scene], parse_methods("gaussian:dense_size=2,gaussian"), tmp_path, [30], [0], SHORT)
+    records = compare([scene], parse_methods("gaussian:init_opacity=0.3,gaussian"), tmp_path, [30], [0], SHORT)
     assert [record["failed"] for record in records] == ["iteration 7: the loss is not finite", None]
     assert not records[0]["finite"]
     bad, good = summarise(records)
     assert cells(bad)[5] == "failed"
     assert float(cells(good)[5]) > 5
-    said = "failed: gaussian:dense_size=2 on yard 48x36 at cap 30, seed 0: iteration 7: the loss is not finite"
+    said = "failed: gaussian:init_opacity=0.3 on yard 48x36 at cap 30, seed 0: iteration 7: the loss is not finite"
     assert said in notes(records, [bad, good])
     assert said in (tmp_path / "table.md").read_text()
 
