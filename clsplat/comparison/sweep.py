@@ -15,9 +15,10 @@ from ..scenes.scene import Scene
 from ..training.log import Progress
 from .charts import arithmetic_chart, seeds_chart
 from .compare import compare
-from .length_rows import equal_time_rows, length_rows
+from .length_rows import equal_time_rows, length_rows, with_shared_seeds
 from .methods import Method
 from .runs import RUNS, Run, distinct, read_runs, refuse_foreign
+from .scene_identity import titled
 from .sweep_charts import equal_chart, length_chart, size_chart, time_chart
 from .sweep_rows import (
     ChartRow,
@@ -29,7 +30,7 @@ from .sweep_rows import (
     write_rows,
 )
 from .sweep_tables import NONE, TextTable, arithmetic_table, equal_table, equal_time_table, seed_table
-from .table import HEAD, Record, cells, notes, summarise
+from .table import HEAD, Record, cells, different_seeds, notes, summarise
 
 CHARTS, REPORT = "charts", "report.html"
 CURVE = 12  # points along a run
@@ -158,7 +159,7 @@ def write_report(
     """
     if not records:
         raise InputError(f"{folder}: no runs to draw")
-    folder, kept = Path(folder), distinct(records)
+    folder, kept = Path(folder), titled(distinct(records))
     points, lengths, seeds = point_rows(kept), length_rows(kept), seed_rows(kept)
     first = reference or next((point["system"] for point in points), "")
     equal, forms = equal_rows(points, first), arithmetic_rows(arithmetic)
@@ -170,12 +171,16 @@ def write_report(
         ("seeds", seeds, seeds_chart, seed_table(seeds)),
         ("arithmetic", forms, arithmetic_chart, arithmetic_table(forms)),
     ]
+    seeds_of = {
+        "length": _seed_notes(with_shared_seeds(kept), lengths),
+        **dict.fromkeys(("size", "equal"), _seed_notes(kept, points)),
+    }
     written: list[Path] = []
     sections = [_protocol(kept)]
     for name, rows, draw, (head, lines) in parts:
         if rows:
             files = write_rows(folder / CHARTS, name, rows)
-            title, *text = _TEXT[name]
+            title, *text = *_TEXT[name], *seeds_of.get(name, [])
             drawn = []
             if name == "equal" and all(row["ratio"] is None for row in rows):
                 text.append(f"No chart: no other system reaches the PSNR of {first}.")
@@ -191,6 +196,18 @@ def write_report(
     return [*written, write_page(folder / REPORT, f"Quality and cost: {', '.join(scenes)}", sections)]
 
 
+def _seed_notes(records: Sequence[Record], points: Sequence[ChartRow]) -> list[str]:
+    """Return the sentences on points of a chart that are means over different seeds of these records."""
+    keys = ("scene", "system", "cap", "iterations")
+    drawn = {tuple(point[key] for key in keys) for point in points}
+    rows = [row for row in summarise(records) if tuple(row[key] for key in keys) in drawn]
+    return [_sentence(text) for text in different_seeds(rows)]
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 def _protocol(records: Sequence[Record]) -> Section:
     """Return the section on the runs, the device and the measurements."""
     iterations = sorted({record["config"]["iterations"] for record in records})
@@ -199,4 +216,4 @@ def _protocol(records: Sequence[Record]) -> Section:
         "from which nothing is chosen",
         *notes(records, summarise(records)),
     ]
-    return Section("Protocol", [f"{line[:1].upper()}{line[1:]}." for line in sentences])
+    return Section("Protocol", [_sentence(line) for line in sentences])

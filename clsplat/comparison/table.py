@@ -114,6 +114,7 @@ def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
         for key, fault in (("cap_held", "more splats than the cap"), ("finite", "parameters that are not finite"))
         if row["seeds"] and not row[key] and not row["failed"]
     ]
+    sentences += different_seeds(rows)
     again = repeats(records)
     if again:
         same = sum(row["same"] for row in again)
@@ -141,6 +142,22 @@ def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
         mixed = " (mixed: seconds and rounding are not those of one machine)" if len(values) > 1 else ""
         sentences.append(f"{name}: {', '.join(values)}{mixed}")
     return sentences
+
+
+def different_seeds(rows: Sequence[Record]) -> list[str]:
+    """Return a sentence for each scene with means over different seeds. rows : of `summarise`."""
+    scenes: dict[str, set[tuple[int, ...]]] = {}
+    for row in rows:
+        if done := [seed for seed in row["seeds"] if str(seed) not in row["failed"]]:
+            scenes.setdefault(row["scene"], set()).add(tuple(sorted(done)))
+    texts = {
+        scene: " or ".join(", ".join(map(str, group)) for group in sorted(groups)) for scene, groups in scenes.items()
+    }
+    return [
+        f"different seeds on {scene}: means are over {texts[scene]}, so their differences are partly chance"
+        for scene, groups in scenes.items()
+        if len(groups) > 1
+    ]
 
 
 def markdown(records: Sequence[Record]) -> str:

@@ -25,7 +25,7 @@ from clsplat.comparison.sweep_rows import (
     write_rows,
 )
 from clsplat.comparison.sweep_tables import equal_table, equal_time_table, seed_table
-from clsplat.comparison.table import Record, summarise
+from clsplat.comparison.table import Record, notes, summarise
 from clsplat.errors import InputError, OutputError
 from clsplat.evaluation import chart_style
 from clsplat.files.html_page import Section, write_page
@@ -268,6 +268,27 @@ def test_report_without_matplotlib(tmp_path: Path, undrawn: None) -> None:
     assert "71 %" in text
     with pytest.raises(InputError, match="no runs to draw"):
         write_report(tmp_path, [])
+
+
+def test_means_over_different_seeds_have_a_note(tmp_path: Path, undrawn: None) -> None:
+    """The note is below the table, and in the sections of the charts whose points have other seeds."""
+    said = "different seeds on yard 8x6: means are over 0 or 0, 1, so their differences are partly chance"
+    plain, more = sweep_records(), run_record("gaussian", 2000, 30.0, 1)
+    records = [*plain, more]
+    assert said in notes(records, summarise(records))
+    assert said not in notes(plain, summarise(plain))
+    failed = run_record("gaussian", 2000, seed=1, failed="lost") | {"psnr": None, "ssim": None}
+    assert said not in notes([*plain, failed], summarise([*plain, failed])), "a mean of one seed"
+    other = [record | {"config": record["config"] | {"seed": 1}} for record in plain[:1]]
+    apart = notes([*other, *plain[1:]], summarise([*other, *plain[1:]]))
+    assert any("means are over 0 or 1," in line for line in apart), "as many, but others"
+    sentence = f"D{said[1:]}."
+    write_report(tmp_path, records, reference="gaussian")
+    assert (tmp_path / "report.html").read_text().count(sentence) == 3, "protocol, size and equal quality"
+    lengths = length_records()
+    write_report(tmp_path, [*lengths, run_record("gaussian", 1000, 30.0, 1, iterations=100)], reference="gaussian")
+    text = (tmp_path / "report.html").read_text()
+    assert text.count(sentence) == 1, "the chart of lengths leaves out a seed of one length, the table does not"
 
 
 def test_a_reference_that_nothing_reaches_has_a_page(tmp_path: Path) -> None:
