@@ -151,7 +151,8 @@ def different_seeds(rows: Sequence[Record]) -> list[str]:
         if done := [seed for seed in row["seeds"] if str(seed) not in row["failed"]]:
             scenes.setdefault(row["scene"], set()).add(tuple(sorted(done)))
     texts = {
-        scene: " or ".join(", ".join(map(str, group)) for group in sorted(groups)) for scene, groups in scenes.items()
+        scene: " or ".join(f"({', '.join(map(str, group))})" for group in sorted(groups))
+        for scene, groups in scenes.items()
     }
     return [
         f"different seeds on {scene}: means are over {texts[scene]}, so their differences are partly chance"

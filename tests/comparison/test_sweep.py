@@ -272,7 +272,7 @@ def test_report_without_matplotlib(tmp_path: Path, undrawn: None) -> None:
 
 def test_means_over_different_seeds_have_a_note(tmp_path: Path, undrawn: None) -> None:
     """The note is below the table, and in the sections of the charts whose points have other seeds."""
-    said = "different seeds on yard 8x6: means are over 0 or 0, 1, so their differences are partly chance"
+    said = "different seeds on yard 8x6: means are over (0) or (0, 1), so their differences are partly chance"
     plain, more = sweep_records(), run_record("gaussian", 2000, 30.0, 1)
     records = [*plain, more]
     assert said in notes(records, summarise(records))
@@ -281,7 +281,7 @@ def test_means_over_different_seeds_have_a_note(tmp_path: Path, undrawn: None) -
     assert said not in notes([*plain, failed], summarise([*plain, failed])), "a mean of one seed"
     other = [record | {"config": record["config"] | {"seed": 1}} for record in plain[:1]]
     apart = notes([*other, *plain[1:]], summarise([*other, *plain[1:]]))
-    assert any("means are over 0 or 1," in line for line in apart), "as many, but others"
+    assert any("means are over (0) or (1)," in line for line in apart), "as many, but others"
     sentence = f"D{said[1:]}."
     write_report(tmp_path, records, reference="gaussian")
     assert (tmp_path / "report.html").read_text().count(sentence) == 3, "protocol, size and equal quality"
