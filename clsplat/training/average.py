@@ -44,17 +44,18 @@ class ParameterAverage:
         return self.begin < iteration <= self._last and (self._last - iteration) % self._every == 0
 
     def add(self, arrays: Mapping[str, Array]) -> None:
-        """Add a sample. It has the splats of the samples before."""
+        """Add a sample. It has the splats of the samples before.
+
+        The arrays belong to the mean afterwards: those of a large model are most of the memory.
+        """
         self.count += 1
-        for name, values in arrays.items():
-            mean = self._mean.get(name)
-            if mean is None:
-                self._mean[name] = values.copy()
-                continue
-            updated = values - mean
-            updated /= np.float32(self.count)  # in place: the arrays of a large model are most of the memory
-            updated += mean
-            self._mean[name] = updated
+        for name in arrays:
+            values, mean = arrays[name], self._mean.get(name)
+            if mean is not None:
+                values -= mean
+                values /= np.float32(self.count)
+                values += mean
+            self._mean[name] = values
 
     def result(self) -> dict[str, Array]:
         """Return the mean of the samples."""

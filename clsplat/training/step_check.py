@@ -54,7 +54,7 @@ def check_step(device: Device, kernels: KernelBuild, position_optimizer: str) ->
             grads = CompactGradients(device, kernels.schema, splats.capacity, kernels.dtype)
             grads.upload({field.name: _slopes(field, steps) for field in grads.schema})
             optimizer.step(grads, 0.01, kernels.sh_degree, iteration)
-        after.append(optimizer.read())
+        after.append(dict(optimizer.read()))
     got, want = after
     for name, values in want.items():
         change = float(np.abs(values - before[name]).max())

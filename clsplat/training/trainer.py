@@ -342,7 +342,7 @@ class Trainer:
 
         After the last iteration they are the mean over the last part of the run (option `average_last`).
         """
-        arrays = self.average.result() if self.has_mean else self.optimizer.read()
+        arrays = self.average.result() if self.has_mean else dict(self.optimizer.read())
         sound = finite_rows(arrays)
         if len(sound) and not sound.any():
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")

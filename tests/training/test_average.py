@@ -45,7 +45,7 @@ class Steps:
         self.after: dict[int, dict[str, Array]] = {}
 
     def __call__(self, trainer: Trainer, stop: threading.Event) -> None:
-        self.after[trainer.iteration] = trainer.optimizer.read()
+        self.after[trainer.iteration] = dict(trainer.optimizer.read())
 
     def mean(self, iterations: range) -> dict[str, Array]:
         names = self.after[iterations[0]]

@@ -252,7 +252,7 @@ def test_training_steps_what_was_seen_and_settles_before_each_action(
     sparse, edited = 0, []
 
     def unchanged(splats: SplatTable) -> DensifyEdit:
-        read, n = trainer.optimizer.read(), trainer.splats.n
+        read, n = dict(trainer.optimizer.read()), trainer.splats.n
         edited.append(all(np.array_equal(splats.field(name), array) for name, array in read.items()))
         return DensifyEdit(np.arange(n), {}, np.zeros(n, bool))
 

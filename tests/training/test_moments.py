@@ -86,7 +86,7 @@ def test_steps_are_close_to_those_of_32_bits(device: Device) -> None:
             optimizer.step(on_device, MEAN_LR, 2, iteration)
             if iteration == 10:
                 optimizer.apply(growing(buffers.download(buffers.n), np.random.default_rng(1)))
-    half, full = (optimizer.read() for _, optimizer in both)
+    half, full = (dict(optimizer.read()) for _, optimizer in both)
     for name, expected in full.items():
         rate = 2.5e-3 if name == "sh" else 0
         assert np.abs(half[name] - expected).max() <= 20 * rate * 0.02, name

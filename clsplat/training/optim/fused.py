@@ -114,8 +114,8 @@ class FusedOptimizer:
     def arranged(self, edit: DensifyEdit) -> DensifyEdit:
         return edit
 
-    def read(self) -> dict[str, Array]:
-        return self.splats.download(self.splats.n)
+    def read(self) -> PendingArrays:
+        return self.splats.pending(self.splats.n)
 
     def apply(self, edit: DensifyEdit) -> None:
         splats, n_old, n_new = self.splats, self.splats.n, len(edit.source)

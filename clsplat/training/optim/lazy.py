@@ -33,7 +33,7 @@ from ...device.pending_arrays import PendingArrays
 from ...device.program import GROUP_ITEMS
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import CompactGradients, SplatBuffers
-from ...splats.fields import Array, Group, sh_coefficients
+from ...splats.fields import Group, sh_coefficients
 from ...splats.morton import morton_order
 from ..density.edit import DensifyEdit
 from ..programs import PARTS, lazy_program
@@ -127,7 +127,7 @@ class VisibleOptimizer(FusedOptimizer):
     def arranged(self, edit: DensifyEdit) -> DensifyEdit:
         return in_morton_order(edit, self.splats)
 
-    def read(self) -> dict[str, Array]:
+    def read(self) -> PendingArrays:
         for group in Group:
             copy_buffer(self.device, self.splats.buffers[group], self.spare[group], self.splats.group_bytes(group))
         settled = copy.copy(self.splats)
@@ -136,7 +136,7 @@ class VisibleOptimizer(FusedOptimizer):
             copy_buffer(self.device, self.skew.s.buffer, self.skew.s.spare, self.skew.s.nbytes)
         self._select("wake_all")
         self._catch_up(settled, None if self.skew is None else self.skew.s.spare, keeps_moments=True)
-        return settled.download(settled.n)
+        return settled.pending(settled.n)
 
     def apply(self, edit: DensifyEdit) -> None:
         self.settle()  # no splat has skipped a step now, so it does not matter which ones move

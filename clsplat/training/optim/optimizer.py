@@ -49,8 +49,11 @@ class Optimizer(Protocol):
     def arranged(self, edit: DensifyEdit) -> DensifyEdit:
         """Return the edit with its rows in the best order for this optimizer. Call `settle` before."""
 
-    def read(self) -> dict[str, Array]:
-        """Return the public arrays of the splats with all skipped steps done; the state does not change."""
+    def read(self) -> Mapping[str, Array]:
+        """Return the public arrays of the splats with all skipped steps done; the state does not change.
+
+        They are copies. Those on the device are read when they are asked for, which must be before the next step.
+        """
 
     def apply(self, edit: DensifyEdit) -> None:
         """Settle, then move, add, remove and reset splats."""
