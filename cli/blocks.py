@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 
+ONE_MODEL = ("save_iterations", "test_iterations")
 BLOCKS_HELP = (
     "Divide a large scene into N x M blocks, which are trained one by one or on workers. auto: blocks of 200000 splats "
     "at most."
@@ -76,7 +77,7 @@ def run_blocks(
     cluster: str | None,
 ) -> None:
     """Train in blocks with a live display, and print the result."""
-    warn_of_single_model(config, "--blocks")
+    warn_of_single_model(config, "--blocks", ONE_MODEL)  # validate is refused
     from clsplat.blocks.train import train_in_blocks
     from clsplat.training.run import evaluate_test_views
 
@@ -115,9 +116,9 @@ def run_blocks(
     report_test_views(evaluate_test_views(result.splats, scene, decided))
 
 
-def warn_of_single_model(config: TrainConfig, flag: str) -> None:
+def warn_of_single_model(config: TrainConfig, flag: str, names: Sequence[str] = (*ONE_MODEL, "validate")) -> None:
     """Warn about options that write or measure models before the last one. Trainings with `flag` ignore them."""
-    for name in ("save_iterations", "test_iterations", "validate"):
+    for name in names:
         if config.named_options.get(name):
             warnings.warn(f"--{name.replace('_', '-')} has no effect with {flag}", stacklevel=2)
 

@@ -241,6 +241,8 @@ def train(
     assert path is not None
     config = TrainConfig(**options)
     blocks = blocks_for(config) if blocks_for is not None else blocks
+    if view and (search is not None or blocks is not None):
+        raise click.UsageError(f"{model_path} is a training of many runs: resume it without --view")
     if cluster is not None and search is None and blocks is None:
         raise click.UsageError("--cluster is for several runs: give --blocks or --budget auto too")
     if cluster is None:  # else each worker has its own devices
@@ -256,8 +258,6 @@ def train(
         run_blocks(ctx, loaded, config, blocks, model_path, resume, overwrite, quiet, cluster)
         return
     if search is not None:
-        if view:
-            raise click.UsageError(f"{model_path} is a search of many runs: resume it without --view")
         run_search(ctx, loaded, config, search, model_path, resume, overwrite, quiet, cluster)
         return
     serving = ServerOptions(host, port, names, token)

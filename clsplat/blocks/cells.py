@@ -40,7 +40,10 @@ def parse_blocks(text: str, cap: int) -> tuple[int, int]:
     found = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
     columns, rows = (int(found[1]), int(found[2])) if found else (0, 0)
     if not (1 <= columns <= MOST_BLOCKS and 1 <= rows <= MOST_BLOCKS) or columns * rows < 2:
-        raise InputError(f"blocks {text!r}: give columns x rows with at least two blocks, such as 2x2, or {AUTO}")
+        raise InputError(
+            f"blocks {text!r}: give columns x rows with at least two blocks, such as 2x2, at most "
+            f"{MOST_BLOCKS} of each, or {AUTO}"
+        )
     return columns, rows
 
 

@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +44,26 @@ from ..training.folder import ModelFolder, scene_record
 from ..training.initialise import FROM_POINTS
 from ..training.log import Progress
 from ..training.stages import StepReports
-from ..training.stored_run import DAMAGE
+from ..training.stored_run import holds_run
 from .job import CONTEXT, INSIDE, RUN, START, BlockJob, train_block, train_block_on_worker
-from .options import block_config
-from .partition import Partition, make_partition, surroundings
+from .options import block_config, of_coarse_run, shares_of_cap
+from .partition import BlockViews, Partition, make_partition, surroundings
 from .picture import write_picture
 from .start import with_points
 from .state import BlocksOptions, BlocksState
+from .stored import (
+    MAKE_AGAIN,
+    START_AGAIN,
+    check_counts,
+    check_exposures,
+    check_inside,
+    check_rows,
+    kept_or_made,
+    left_out,
+    splats_of,
+    stored_caps,
+    stored_partition,
+)
 
 STEPS = 4  # coarse, partition, blocks, polish
 COARSE_CAP, POLISH = 0.25, 0.5  # of the cap, and of the iterations of a block
@@ -141,6 +156,12 @@ def _opened(
             state.check(config, options)
         scene = with_small_photos_in_memory(scene)
         if not resume:
+            if names := of_coarse_run(config):
+                warnings.warn(
+                    f"{', '.join(names)}: only the coarse run has these values; blocks and the polish split splats by "
+                    "their gradients, without penalties",
+                    stacklevel=4,
+                )
             config = decide(scene, config).tell(progress)
             folder.clear()
             state.begin(config, options, scene_record(scene, folder.path))
@@ -154,7 +175,7 @@ def check_options(config: TrainConfig, options: BlocksOptions) -> None:
     if config.cap_max < options.count:
         raise InputError(f"cap_max {config.cap_max}: less than a splat for each of {options.count} blocks: raise it")
     if config.validation.validate:
-        raise InputError("validate: each block has other photos: leave --validate out")
+        raise InputError("validate True: each block has other photos: leave --validate out")
     if config.start.init not in FROM_POINTS:
         raise InputError(f"init {config.start.init}: blocks start from a coarse model of their own: leave --init out")
 
@@ -180,7 +201,9 @@ class _Stages:
     def run(self) -> BlocksModel:
         """Run the missing stages."""
         partition = self.divided()
-        if "blocks" not in self.state.values:
+        if "blocks" in self.state.values:
+            check_rows(self.state, [block.number for block in partition.blocks if block.views])
+        if "blocks" not in self.state.values or not (self.state.folder / MERGED).is_file():
             self.train_blocks(partition)
         return self.finish()
 
@@ -190,30 +213,35 @@ class _Stages:
             self.train_coarse()
         if "partition" not in self.state.values:
             self.divide()
-        try:
-            return Partition.from_json(self.state.values["partition"])
-        except DAMAGE as error:
-            raise InputError(f"{self.state.path}: damaged ({error!r}): start again with --overwrite") from None
+        names = [view.name for view in self.scene.train]
+        return stored_partition(self.state, self.options.columns, self.options.rows, names)
 
     def coarse(self) -> Splats:
-        """Return the coarse model."""
-        folder = self.state.run_folder("coarse")
+        """Return the coarse model. A missing file of it is made again if the checkpoint of its run is there."""
+        folder, config = self.state.run_folder("coarse"), self.coarse_config
+        can_make = folder.checkpoint_path.is_file() and holds_run(folder, config)
         if not folder.iterations():
-            raise InputError(f"{folder.path}: the coarse model is gone: start again with --overwrite")
-        return Splats.load(folder.latest_ply()[0])
+            if not can_make:
+                raise InputError(f"{folder.path}: the coarse model is gone", START_AGAIN)
+            self.train_whole("coarse", config)
+        return splats_of(folder.latest_ply()[0], MAKE_AGAIN if can_make else START_AGAIN)
+
+    @property
+    def coarse_config(self) -> TrainConfig:
+        """Options of the coarse run."""
+        return self.config.replace(cap_max=max(math.ceil(COARSE_CAP * self.config.cap_max), 1))
 
     def train_coarse(self) -> None:
         """Make the coarse model."""
-        config = self.config.replace(cap_max=max(math.ceil(COARSE_CAP * self.config.cap_max), 1))
+        config = self.coarse_config
         self.steps.tell(1, f"a coarse model of {config.iterations} iterations with at most {config.cap_max} splats")
         self.state.put("coarse", self.train_whole("coarse", config))
 
     @property
     def scene(self) -> Scene:
         """The scene without the photos that the coarse run has left out because they disagree with all others."""
-        coarse = self.state.values.get("coarse")
-        gone = coarse.get("left_out") if isinstance(coarse, dict) else None
-        if not isinstance(gone, list):
+        gone = left_out(self.state) if "coarse" in self.state.values else frozenset()
+        if not gone:
             return self.whole
         return replace(self.whole, views=[view for view in self.whole.views if view.name not in gone])
 
@@ -234,40 +262,70 @@ class _Stages:
         """
         coarse = self.coarse()
         blocks = [block for block in partition.blocks if block.views]
-        cap = self.config.cap_max // max(len(blocks), 1)
-        self.steps.tell(3, f"{len(blocks)} blocks with at most {cap} splats, {self.config.iterations} iterations each")
         cell = partition.cells.of(coarse.mean)
+        check_counts(self.state, partition, np.bincount(cell, minlength=partition.cells.count).tolist())
         folders = {block.number: real_path(self.state.folder) / f"block_{block.number}" for block in blocks}
         # A training that goes on keeps the parts of its blocks, because another device may choose other surroundings.
         new = {number for number, folder in folders.items() if not (folder / CONTEXT).is_file()}
+        caps = self.caps(blocks, len(coarse), is_begun=len(new) < len(blocks))
+        largest = max(caps, default=0)
+        self.steps.tell(
+            3, f"{len(blocks)} blocks with at most {largest} splats, {self.config.iterations} iterations each"
+        )
         around = surroundings(self.scene, coarse, Renderer(self.config.device), partition) if new else []
         source, jobs = SceneSource.of(self.scene), []
-        for block in blocks:
-            folder = folders[block.number]
-            inside = coarse.select(np.flatnonzero(cell == block.number))
-            if block.number in new:
-                folder.mkdir(parents=True, exist_ok=True)
-                inside.save(folder / INSIDE)
-                with_points(inside, self.scene, partition.cells, block.number, cap, self.config).save(folder / START)
-                copy_exposures(self.state.run_folder("coarse"), exposures_beside(folder / START))
-                coarse.select(around[block.number]).save(folder / CONTEXT)  # the last one: the others are complete
-            config = block_config(self.config, folder / START, max(cap, len(inside)))
+        for block, cap in zip(blocks, caps, strict=True):
+            number, folder = block.number, folders[block.number]
+            rows = np.flatnonzero(cell == number)
+            inside = coarse.select(rows)
+            first = partial(with_points, inside, self.scene, partition.cells, number, cap, self.config)
+            folder.mkdir(parents=True, exist_ok=True)
+            check_inside(folder, kept_or_made(folder / INSIDE, partial(coarse.select, rows)), inside)
+            kept_or_made(folder / START, first)
+            self.pass_exposures("coarse", exposures_beside(folder / START))
+            kept_or_made(folder / CONTEXT, partial(coarse.select, around[number] if new else []))
+            config = block_config(self.config, folder / START, cap)
             config = config.replace(exposure_rate=0.0)  # exposures are common to all blocks
             jobs.append(BlockJob(source.of_views(block.views), config, folder, 1.0 / len(blocks)))
-        rows = self.train_all(jobs, [f"block {block.number}" for block in blocks])
+        results = self.train_all(jobs, [f"block {block.number}" for block in blocks])
         parts = [coarse.select(np.flatnonzero(~np.isin(cell, [block.number for block in blocks])))]
-        for block, job, row in zip(blocks, jobs, rows, strict=True):
-            trained = Splats.load(ModelFolder(job.folder / RUN).latest_ply()[0])
+        for block, job, row in zip(blocks, jobs, results, strict=True):
+            trained = splats_of(ModelFolder(job.folder / RUN).latest_ply()[0])
             parts.append(trained.select(np.arange(len(trained) - row["context"])))
             row |= {"number": block.number, "views": len(block.views)}
         joined([part for part in parts if len(part)]).save(self.state.folder / MERGED)
-        self.state.put("blocks", rows)
+        self.state.put("blocks", results)
+
+    def caps(self, blocks: Sequence[BlockViews], n_coarse: int, is_begun: bool) -> list[int]:
+        """Return the caps of the blocks that are trained.
+
+        Parameters
+        ----------
+        n_coarse : splats of the coarse model; those of blocks that no photo shows stay in the model.
+        is_begun : whether a block has its parts. Earlier versions did not store caps, and all were equal.
+        """
+        counts, cap = [block.splats for block in blocks], self.config.cap_max
+        if "caps" in self.state.values:
+            return stored_caps(self.state, counts)
+        if is_begun:
+            caps = [max(cap // len(blocks), count) for count in counts]
+        else:
+            caps = shares_of_cap(cap - n_coarse + sum(counts), counts)
+        self.state.put("caps", caps)
+        return caps
+
+    def pass_exposures(self, stage: str, target: Path) -> None:
+        """Copy the exposures that a stage has learned to a file. Raise InputError if they are gone or damaged."""
+        folder = self.state.run_folder(stage)
+        if self.config.appearance.exposure:
+            check_exposures(folder)
+        copy_exposures(folder, target)
 
     def finish(self) -> BlocksModel:
         """Train all blocks together for a short time, and write the model."""
         polish, start = self.options.polish, time.perf_counter()
         iterations = math.ceil(POLISH * self.config.iterations) if polish is None else polish
-        whole = Splats.load(self.state.folder / MERGED)
+        whole = splats_of(self.state.folder / MERGED)
         if iterations:
             self.steps.tell(4, f"{len(whole)} splats together, {iterations} iterations")
         before = "coarse"
@@ -279,12 +337,12 @@ class _Stages:
             name, part = f"polish_{number}", Part((last - first) / run.iterations, rate)
             file = real_path(self.state.folder) / f"{name}.ply"
             whole.save(file)
-            copy_exposures(self.state.run_folder(before), exposures_beside(file))
+            self.pass_exposures(before, exposures_beside(file))
             self.train_whole(name, fine_tuning(run, whole, part, file))
-            whole, before = Splats.load(self.state.run_folder(name).latest_ply()[0]), name
+            whole, before = splats_of(self.state.run_folder(name).latest_ply()[0]), name
         self.folder.write_run(self.state.values["config"], self.whole)
         self.folder.write_views([*self.whole.test, *self.whole.train])
-        copy_exposures(self.state.run_folder(before), self.folder.exposures_path)
+        self.pass_exposures(before, self.folder.exposures_path)
         path = self.folder.ply_path(self.config.iterations + iterations)
         whole.save(path)
         seconds = round(time.perf_counter() - start, 2)
@@ -294,7 +352,8 @@ class _Stages:
 
     def train_whole(self, name: str, config: TrainConfig) -> dict[str, Any]:
         """Make a run of the whole scene in this process, and return what it took."""
-        return train_in_folder(config, self.scene, self.state.run_folder(name).path, None, self.steps.progress)
+        scene = self.whole if name == "coarse" else self.scene
+        return train_in_folder(config, scene, self.state.run_folder(name).path, None, self.steps.progress)
 
     def train_all(self, jobs: Sequence[BlockJob], names: Sequence[str]) -> list[dict[str, Any]]:
         """Train blocks here or on workers, and return what each took."""

@@ -182,10 +182,16 @@ def _make(folder: Path) -> None:
 
 
 def marked(place: Path) -> Path:
-    """Return the absolute path of a folder for runs of workers, which see by a file in it that it is this one."""
+    """Return the absolute path of a folder for runs of workers, which see by a file in it that it is this one.
+
+    Raises OutputError if it cannot be written.
+    """
     place = real_path(place)
-    place.mkdir(parents=True, exist_ok=True)
-    (place / MARK).touch()
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        (place / MARK).touch()
+    except OSError as error:
+        raise OutputError(f"{place}: cannot be written ({error.strerror or error}); check rights and space") from None
     return place
 
 

@@ -388,7 +388,7 @@ class Trainer:
         if self.progress is not None:
             loss, psnr = self.running.means()
             speed = (self.iteration - since) / (time.perf_counter() - started)
-            counts = self.splats.n, self.seconds, speed
+            counts = self.splats.n if self.frozen is None else self.frozen.n_live, self.seconds, speed
             left = self.clock.forecast.seconds_left()
             self.progress(Progress(self.iteration, self.config.iterations, loss, psnr, *counts, forecast=left))
 

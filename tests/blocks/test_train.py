@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 
 from clsplat.blocks import train as module
+from clsplat.blocks.cells import Cells, make_cells
 from clsplat.blocks.job import CONTEXT, START, BlockJob
 from clsplat.blocks.options import block_config
 from clsplat.blocks.partition import Partition, make_partition, surroundings
@@ -32,6 +32,7 @@ from clsplat.splats.transform import joined
 from clsplat.training.config import TrainConfig
 from clsplat.training.exposure_file import read_exposures
 from clsplat.training.folder import ModelFolder
+from clsplat.training.log import Progress
 from clsplat.training.presets import PRESETS, with_preset
 from clsplat.training.run import train
 
@@ -491,29 +492,51 @@ def test_blocks_that_no_photo_shows_leave_their_share_of_the_cap_to_the_others(
     partition_scene(scene, TWO, CONFIG, output=tmp_path)
     file = tmp_path / "blocks.json"
     values = json.loads(file.read_text())
-    values["partition"]["blocks"][1]["views"] = []
+    unseen = values["partition"]["blocks"][1]
+    unseen |= {"views": [], "shares": []}
     file.write_text(json.dumps(values))
-    train_in_blocks(scene, TWO, CONFIG, lambda at: told.append(at.message or ""), output=tmp_path, resume=True)
-    assert any("1 blocks with at most 120 splats" in text for text in told)
+    found = train_in_blocks(scene, TWO, CONFIG, lambda at: told.append(at.message), output=tmp_path, resume=True)
+    assert any(f"1 blocks with at most {120 - unseen['splats']} splats" in text for text in told), "it keeps its own"
+    assert len(found.splats) <= 120
 
 
-def test_damaged_stages_are_one_line(scene: Scene, tmp_path: Path) -> None:
-    partition_scene(scene, TWO, CONFIG, output=tmp_path)
+def test_the_cap_is_that_of_the_whole_model(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if one cell has nearly all splats of the coarse model, more than an equal share of the cap."""
+
+    def uneven(places: Any, weights: Any, cameras: Any, columns: int, rows: int) -> Cells:
+        equal = make_cells(places, weights, cameras, columns, rows)
+        along = np.sort(equal.axes[0] @ np.asarray(places, float).T)
+        return Cells(equal.axes, along[[1, 2, 3, 4, 5]], equal.rows)
+
+    monkeypatch.setattr("clsplat.blocks.partition.make_cells", uneven)
+    told: list[str] = []
+    options = BlocksOptions(6, 1, polish=0)
+    found = train_in_blocks(scene, options, CONFIG, lambda at: told.append(at.message), output=tmp_path)
+    most = max(block["splats"] for block in found.report["partition"]["blocks"])
+    assert most > 120 // 6
+    assert any(f"blocks with at most {most} splats" in text for text in told)
+    assert len(found.splats) <= 120
+    assert all(row["splats"] <= cap for row, cap in zip(found.report["blocks"], found.report["caps"], strict=True))
+
+
+def test_a_training_of_an_earlier_version_keeps_its_caps(
+    finished: BlocksModel, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has not stored them. Its blocks have equal caps, but for those with more splats of the coarse model."""
+    monkeypatch.setattr(module, "shares_of_cap", lambda cap, counts: [cap // len(counts)] * len(counts))
+    stop_in_run(monkeypatch, 2)
+    with pytest.raises(KeyboardInterrupt):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
+    monkeypatch.undo()
     file = tmp_path / "blocks.json"
-    good = file.read_text()
-    for damage in ("views", "rows"):
-        values = json.loads(good)
-        if damage == "views":
-            del values["partition"]["blocks"][0]["views"]
-        else:
-            values["partition"]["cells"]["rows"] = [1.0, 2.0, 3.0]
-        file.write_text(json.dumps(values))
-        with pytest.raises(InputError, match=r"blocks\.json: damaged .*--overwrite"):
-            train_in_blocks(scene, TWO, CONFIG, output=tmp_path, resume=True)
-    file.write_text(good)
-    shutil.rmtree(tmp_path / "blocks" / "coarse" / "point_cloud")
-    with pytest.raises(InputError, match="the coarse model is gone: start again with --overwrite"):
-        train_in_blocks(scene, TWO, CONFIG, output=tmp_path, resume=True)
+    values = json.loads(file.read_text())
+    assert values.pop("caps") == [60, 60]
+    file.write_text(json.dumps(values))
+    monkeypatch.setattr(module, "shares_of_cap", lambda cap, counts: [1] * len(counts))
+    told: list[str] = []
+    found = train_in_blocks(scene, TWO, CONFIG, lambda at: told.append(at.message), output=tmp_path, resume=True)
+    assert not any("anew" in text for text in told)
+    assert found.path.read_bytes() == finished.path.read_bytes()
 
 
 def test_photos_that_the_coarse_run_leaves_out_are_in_no_later_stage(
@@ -531,3 +554,17 @@ def test_photos_that_the_coarse_run_leaves_out_are_in_no_later_stage(
     assert all(not row["left_out"] for row in found.report["blocks"]), "blocks do not look"
     recorded = json.loads((tmp_path / "config.json").read_text())["scene"]["photos"]
     assert gone in recorded, "the record has all photos of the scene"
+
+
+def test_options_that_only_the_coarse_run_has_are_named(scene: Scene, tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="^noise_lr, strategy: only the coarse run has these values"):
+        partition_scene(scene, TWO, CONFIG.replace(strategy="mcmc", noise_lr=5.0), output=tmp_path)
+
+
+def test_a_block_reports_its_own_splats(scene: Scene, tmp_path: Path) -> None:
+    """Not those around it, which do not change."""
+    heard: list[Progress] = []
+    train_in_blocks(scene, TWO, CONFIG, heard.append, output=tmp_path)
+    of_blocks = [report.n_splats for report in heard if report.phase == "step 3 of 4" and not report.message]
+    assert of_blocks
+    assert max(of_blocks) <= CONFIG.cap_max // 2

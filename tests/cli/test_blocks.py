@@ -34,7 +34,11 @@ def test_train_in_blocks_at_once(scene: Path, tmp_path: Path) -> None:
 
 def test_mistakes_are_one_line(scene: Path, tmp_path: Path) -> None:
     arguments = ("train", scene, "-m", tmp_path / "m")
+    assert "such as 2x2, at most 64 of each, or auto" in error_of(*arguments, "--blocks", "65x1")
     assert "such as 2x2" in error_of(*arguments, "--blocks", "4")
+    both = run(*arguments, "--blocks", "2x1", "--validate", *TINY)
+    assert both.stderr.count("validate") == 2, "the option in one line"
+    assert "validate True: each block has other photos: leave --validate out" in both.stderr
     assert "give --blocks too" in error_of(*arguments, "--polish", "4", code=2)
     assert "remove --view and --budget" in error_of(*arguments, "--blocks", "2x2", "--budget", "auto", code=2)
     assert "name the blocks" in error_of("partition", scene, "-m", tmp_path / "m")
@@ -46,6 +50,7 @@ def test_what_has_no_effect_and_what_cannot_change(scene: Path, tmp_path: Path) 
     said = run("partition", scene, "-m", folder, "--blocks", "2x1", "--save-iterations", "6,12", *TINY)
     assert "--save-iterations has no effect with --blocks" in said.stderr
     assert f"clsplat train --resume -m '{folder}'" in said.stdout
+    assert "many runs: resume it without --view" in error_of("train", "--resume", "-m", folder, "--view", code=2)
     assert "--polish stays as it was" in error_of("train", "--resume", "-m", folder, "--polish", "5", code=2)
 
 
