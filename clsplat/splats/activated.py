@@ -6,7 +6,6 @@ of any norm, logarithms and raw opacities. Position, harmonics and the fields of
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -26,18 +25,18 @@ _LARGEST_LOG_SCALE = float(np.log(np.finfo(np.float32).max))
 _ACTIVATED = ("log_scale", "opacity_logit")
 
 
-def activated(path: str | os.PathLike[str], splats: StoredSplats, signs: Signs) -> dict[str, Array]:
+def activated(splats: StoredSplats, signs: Signs) -> dict[str, Array]:
     """Return mean, quat, scale, opacity, sh and the field of the shape, with other signs of the axes.
 
     Computed values are float64, the others have the type of the splats. InputError : float32 does not hold a scale.
 
-    path : file to write, for messages. splats : of a shape in EXTRA_FIELDS.
+    splats : of a shape in EXTRA_FIELDS.
     """
     largest = splats.arrays["log_scale"].max(axis=1, initial=-np.inf)
     if (largest > _LARGEST_LOG_SCALE).any():
         number = int(np.argmax(largest))
         raise InputError(
-            f"{path}: splat {number} has the scale e^{largest[number]:.4g}, which float32 does not hold: remove it, or "
+            f"splat {number} has the scale e^{largest[number]:.4g}, which float32 does not hold: remove it, or "
             "write a .ply"
         )
     values = flipped(splats.arrays, signs)

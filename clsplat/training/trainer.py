@@ -359,7 +359,7 @@ class Trainer:
             self.iteration,
             self.config.to_json(),
             self.splats.pending(self.splats.n),
-            PendingArrays.of(self.optimizer.pending(), self.exposure.state()),
+            PendingArrays.of(self.optimizer.state(), self.exposure.state()),
             dict(self.rng.bit_generator.state),
             self.views.queue,
             self.seconds,

@@ -120,7 +120,7 @@ def test_lazy_steps_equal_dense_ones(device: Device, options: dict[str, object])
             assert_near(optimizer.read(), truth)
             assert_near(buffers.download(buffers.n), stored, 0.0)
     assert waited
-    states = [optimizer.state() for _, optimizer in lazy.values()]
+    states = [dict(optimizer.state()) for _, optimizer in lazy.values()]
     assert set(states[0]) == set(states[1]) == set(dense[1].state()) | {"waiting.last", "waiting.drifts"}
     for name, expected in states[1].items():
         near = 1e-4 if name == "momentum" else 1e-5  # the gate amplifies the rounding of an opacity a hundred times
@@ -190,7 +190,7 @@ def test_a_state_continues_to_the_same_bits(devices: list[Device]) -> None:
     buffers, optimizer = started(devices[0], config, some_splats(config.shape))
     for iteration in range(1, 12):
         step(buffers, optimizer, gradients(buffers, rng), some_seen(300, rng), iteration)
-    state, splats = optimizer.state(), Splats(config.shape, buffers.download(300))
+    state, splats = dict(optimizer.state()), Splats(config.shape, buffers.download(300))
     grads, seen = gradients(buffers, rng), some_seen(300, rng)
     step(buffers, optimizer, grads, seen, 12)
     for name, tolerance in (("fused", 0.0), ("numpy", TOLERANCE)):

@@ -189,7 +189,7 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
     for name, expected in numpy.items():
         length = splats.schema[name].limit or 1.0
         np.testing.assert_allclose(fused[name], expected, TOLERANCE, TOLERANCE * length, err_msg=name)
-    states = [optimizer.state() for _, optimizer in both.values()]
+    states = [dict(optimizer.state()) for _, optimizer in both.values()]
     assert set(states[0]) == set(states[1])
     for name, expected in states[1].items():
         near = 3e-5 if name == "momentum" else 1e-6  # the gate amplifies the rounding of an opacity a hundred times
@@ -204,10 +204,10 @@ def test_an_edit_moves_parameters_and_states(devices: list[Device], name: str) -
     rng = np.random.default_rng(3)
     for iteration, make_edit in enumerate((shrinking, growing), start=1):
         step(buffers, optimizer, gradients(buffers, rng), iteration)
-        old, state = buffers.download(buffers.n), optimizer.state()
+        old, state = buffers.download(buffers.n), dict(optimizer.state())
         edit = make_edit(old, rng)
         optimizer.apply(edit)
-        moved, after = buffers.download(buffers.n), optimizer.state()
+        moved, after = buffers.download(buffers.n), dict(optimizer.state())
         for field, expected in edit.apply(old).items():
             np.testing.assert_array_equal(moved[field], expected, err_msg=field)
         for key in state:
@@ -229,9 +229,9 @@ def test_a_frozen_group_keeps_values_moments_and_count(devices: list[Device], na
     buffers, optimizer = started(devices[0], config, some_splats(config.shape))
     rng = np.random.default_rng(3)
     for iteration in range(1, 7):
-        before = optimizer.state() | buffers.download(buffers.n)
+        before = dict(optimizer.state()) | buffers.download(buffers.n)
         step(buffers, optimizer, gradients(buffers, rng), iteration)
-        after = optimizer.state() | buffers.download(buffers.n)
+        after = dict(optimizer.state()) | buffers.download(buffers.n)
         base = (iteration - 1) % 4 < 2
         for key in set(before) - {"steps"}:
             assert np.array_equal(before[key], after[key]) == (("skew" in key) == base), key
@@ -267,7 +267,7 @@ def test_a_state_continues_to_the_same_bits_and_goes_from_one_optimizer_to_the_o
     rng = np.random.default_rng(3)
     for iteration in range(1, 7):
         step(buffers, optimizer, gradients(buffers, rng), iteration)
-    state, splats = optimizer.state(), Splats(config.shape, buffers.download(buffers.n))
+    state, splats = dict(optimizer.state()), Splats(config.shape, buffers.download(buffers.n))
     grads = gradients(buffers, rng)
     step(buffers, optimizer, grads, 7)
     for name, tolerance in (("fused", 0.0), ("numpy", TOLERANCE)):

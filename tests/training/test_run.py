@@ -214,7 +214,7 @@ def test_regularisers_pull_opacity_and_scale_down(scene: Scene, default_device: 
         trainer = Trainer(scene, replace(CONFIG, opacity_reg=weight, scale_reg=2 * weight), device=default_device)
         first = trainer.snapshot()
         trainer.step()
-        moments = trainer.optimizer.state()  # a tenth of the gradients, after one step
+        moments = dict(trainer.optimizer.state())  # a tenth of the gradients, after one step
         grads.append({name: 10 * moments[f"first.{name}"] for name in ("opacity_logit", "log_scale")})
     opacity = 1 / (1 + np.exp(-first.opacity_logit.astype(float)))
     added = grads[1]["opacity_logit"] - grads[0]["opacity_logit"]

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._version import __version__
-from ...errors import InputError
+from ...errors import InputError, named_place
 from ..activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arrays
 from ..axes import LUF
 from ..fields import MAX_SH_DEGREE, Array, DoubleArray, public_shape, sh_coefficients
@@ -79,7 +79,8 @@ def write_gltf_splats(path: str | os.PathLike[str], splats: StoredSplats) -> Non
         raise InputError(f"{path}: .glb files hold {', '.join(_KERNELS)} splats, not {splats.shape}; convert them")
     if not len(splats.arrays["mean"]):
         raise InputError(f"{path}: the model has no splats, and glTF has no empty arrays: write a .ply")
-    attributes = _attributes(path, splats)
+    with named_place(str(path)):
+        attributes = _attributes(splats)
     extension: Json = {
         "kernel": _KERNELS[splats.shape],
         "colorSpace": _SRGB,
@@ -114,9 +115,9 @@ def write_gltf_splats(path: str | os.PathLike[str], splats: StoredSplats) -> Non
     write_glb(path, document, attributes)
 
 
-def _attributes(path: str | os.PathLike[str], splats: StoredSplats) -> dict[str, NDArray[Any]]:
-    """Return the attributes of the primitive, (N, width) each. path : file to write, for messages."""
-    values = activated(path, splats, LUF)
+def _attributes(splats: StoredSplats) -> dict[str, NDArray[Any]]:
+    """Return the attributes of the primitive, (N, width) each."""
+    values = activated(splats, LUF)
     sh, opacity = values["sh"], values[OPACITY][:, None]
     color = np.clip(0.5 + SH_C0 * sh[:, 0], 0.0, 1.0)
     single = {

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, OutputError
+from ...errors import InputError, OutputError, named_place
 from ...files.atomic import atomic_path
 from ...files.file_names import printable
 from ...files.host_memory import limit_address_space
@@ -91,7 +91,8 @@ def write_usd(path: str | os.PathLike[str], splats: StoredSplats) -> None:
             layer = temporary.with_suffix(".usdc") if packed else temporary
             try:
                 stage = Usd.Stage.CreateNew(str(layer))
-                _define(stage, path, splats)
+                with named_place(str(path)):
+                    _define(stage, splats)
                 stage.GetRootLayer().Save()
                 if packed:
                     name = Path(path).with_suffix(".usdc").name  # of the layer in the archive
@@ -119,15 +120,15 @@ def _without_times(archive: Path) -> None:
             place += _ENTRY + sum(lengths)
 
 
-def _define(stage: Any, path: str | os.PathLike[str], splats: StoredSplats) -> None:
-    """Define the splats on an empty stage. path : file to write, for messages."""
+def _define(stage: Any, splats: StoredSplats) -> None:
+    """Define the splats on an empty stage."""
     from pxr import Gf, Sdf, UsdGeom, Vt
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     prim = stage.DefinePrim(_PRIM, _TYPE)
     stage.SetDefaultPrim(prim)
-    values = activated(path, splats, RUB)
+    values = activated(splats, RUB)
 
     def put(name: str, kind: Any, value: Any, custom: bool = False) -> Any:
         attribute = prim.CreateAttribute(name, kind, custom, Sdf.VariabilityVarying if not custom else _uniform())

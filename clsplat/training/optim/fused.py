@@ -148,7 +148,7 @@ class FusedOptimizer:
         self._set_values(edit, source)
         self._reset_fields(edit.reset_fields)
 
-    def pending(self) -> PendingArrays:
+    def state(self) -> PendingArrays:
         steps = {"steps": np.array([self.steps, self.skew.steps if self.skew else 0])}
         rows: dict[str, StateRows] = {}
         if self.skew is not None:
@@ -157,13 +157,10 @@ class FusedOptimizer:
             rows["momentum"] = self.momentum
         n = self.splats.n
         others = PendingArrays({name: partial(each.get, n) for name, each in rows.items()})
-        return PendingArrays.of(steps, self.moments.pending(n, self._base_names), others)
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        return dict(self.pending())
+        return PendingArrays.of(steps, self.moments.state(n, self._base_names), others)
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        check_state(state, self.pending())
+        check_state(state, self.state())
         self.steps = int(state["steps"][0])
         self.moments.load_state(state, self._base_names)
         if self.skew is not None:

@@ -142,10 +142,10 @@ class VisibleOptimizer(FusedOptimizer):
         self.settle()  # no splat has skipped a step now, so it does not matter which ones move
         super().apply(edit)
 
-    def pending(self) -> PendingArrays:
+    def state(self) -> PendingArrays:
         last = to_host(self.device, self._last, np.empty((2, self._vectors), np.uint32))
         lazy = {"waiting.last": last[:, : self._used].copy(), "waiting.drifts": self.drifts.sums.copy()}
-        return PendingArrays.of(super().pending(), lazy)
+        return PendingArrays.of(super().state(), lazy)
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         super().load_state(state)

@@ -58,12 +58,12 @@ class VisibleReferenceOptimizer(ReferenceOptimizer):
         super().apply(edit)
         self._mark_settled()
 
-    def pending(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, NDArray[Any]]:
         lazy: dict[str, NDArray[Any]] = {
             "waiting.last": self.last.astype(np.uint32),
             "waiting.drifts": self.drifts.sums.copy(),
         }
-        return super().pending() | lazy
+        return super().state() | lazy
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         super().load_state(state)

@@ -61,7 +61,7 @@ class AdamMoments:
             return {"sh_m": self.first.sh, "sh_v": self.second.sh}
         return {"sh_moments": self.first.sh, "seed_lo": seed & 0xFFFFFFFF, "seed_hi": seed >> 32, "step": step}
 
-    def pending(self, n: int, names: tuple[str, ...]) -> PendingArrays:
+    def state(self, n: int, names: tuple[str, ...]) -> PendingArrays:
         """Return the moments of n splats by "first.NAME" and "second.NAME", as 32-bit numbers."""
 
         def read(order: int, name: str) -> Array:

@@ -58,14 +58,11 @@ class Optimizer(Protocol):
     def apply(self, edit: DensifyEdit) -> None:
         """Settle, then move, add, remove and reset splats."""
 
-    def pending(self) -> Mapping[str, NDArray[Any]]:
+    def state(self) -> Mapping[str, NDArray[Any]]:
         """Return the state for a checkpoint, without the splats. Both optimizers use the same keys.
 
-        Arrays on the device are read when they are asked for.
+        Arrays on the device are read when they are asked for, which must be before the next step.
         """
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Return the present state, with all arrays in memory."""
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from `state`. Raise InputError if an entry is missing, unknown, or of another shape."""

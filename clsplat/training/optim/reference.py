@@ -87,7 +87,7 @@ class ReferenceOptimizer:
                     moments[name] = edit.apply_state(info, name)
         self.momentum = edit.apply_state(self.momentum, "mean")
 
-    def pending(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, NDArray[Any]]:
         state: dict[str, NDArray[Any]] = {"steps": np.array([self.base.step_count, self.skew.step_count])}
         for adam in (self.base, self.skew) if self.rules.map is not None else (self.base,):
             state |= {f"first.{name}": info.copy() for name, info in adam.first.items()}
@@ -98,11 +98,8 @@ class ReferenceOptimizer:
             state["momentum"] = self.momentum.copy()
         return state
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        return self.pending()
-
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        check_state(state, self.pending())
+        check_state(state, self.state())
         self.base.step_count, self.skew.step_count = (int(count) for count in state["steps"])
         for adam in (self.base, self.skew) if self.rules.map is not None else (self.base,):
             adam.first = {name: state[f"first.{name}"].copy() for name in adam.first}
