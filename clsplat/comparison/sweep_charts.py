@@ -148,7 +148,9 @@ def equal_chart(rows: Sequence[ChartRow], reference: str, out: str | Path) -> li
             low, high = min(sizes) / 1.3, max(sizes) * 1.3
             axes.set(xscale="log", xlim=(low, high), title=scene, xlabel=f"splats of {reference}")
             log_axis(axes.xaxis, low, high)
-        panels[0].set_ylim(0, max(110, 105 * max(row["ratio"] for row in rows)))
+        low, high = (edge([100 * row["ratio"] for row in rows] + [100]) for edge in (min, max))
+        panels[0].set(yscale="log", ylim=(low / 1.15, high * 1.15))  # one outlier must not flatten the rest
+        log_axis(panels[0].yaxis, low / 1.15, high * 1.15)
         panels[0].set_ylabel(f"splats for the same PSNR\n[% of {reference}'s]")
         system_legend(figure, styles)
     return chart_paths(out)

@@ -136,6 +136,9 @@ def test_equal_chart(tmp_path: Path, drawn: list[Any]) -> None:
     assert list(reached.get_xdata()) == [2000, 4000]
     assert list(reached.get_ydata()) == pytest.approx([100 / 2**0.5] * 2)
     assert (list(bound.get_xdata()), bound.get_markerfacecolor()) == ([1000], "white")
+    low, high = axes.get_ylim()
+    assert axes.get_yscale() == "log"
+    assert low < 100 / 2**0.5 < 100 < high
     out_of_reach = [row for row in equal_rows(point_rows(sweep_records()), "default") if row["ratio"] is None]
     with pytest.raises(InputError, match="needs points"):
         equal_chart(out_of_reach, "default", tmp_path / "none")
