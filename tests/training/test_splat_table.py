@@ -112,3 +112,24 @@ def test_plans_of_splats_on_the_device_equal_those_of_the_host(
 def test_the_smallest_are_those_of_a_stable_sort(values: np.ndarray, count: int) -> None:
     expected = np.sort(np.argsort(values, kind="stable")[: max(count, 0)])
     np.testing.assert_array_equal(smallest(values, count), expected)
+
+
+@pytest.mark.parametrize("count", [1, 3, 900, 15_000, 29_999, 40_000])
+@pytest.mark.parametrize("order", ["random", "rising", "falling", "few values", "sampled ones are small", "... large"])
+def test_the_smallest_of_many_values_are_those_of_a_stable_sort(order: str, count: int) -> None:
+    values = np.random.default_rng(1).standard_normal(30_000).astype(np.float32)
+    if order in ("rising", "falling"):
+        values = np.sort(values)[:: 1 if order == "rising" else -1]
+    elif order == "few values":
+        values = np.round(values)
+    elif order != "random":  # every third value is in the sample
+        values[::3] += -100.0 if "small" in order else 100.0
+    expected = np.sort(np.argsort(values, kind="stable")[:count])
+    np.testing.assert_array_equal(smallest(values, count), expected)
+
+
+def test_a_sample_that_is_too_small_a_bound_leaves_no_value_out() -> None:
+    values = np.ones(30_000, np.float32)
+    values[::3] = -np.arange(10_000)  # the sample is of these alone
+    np.testing.assert_array_equal(smallest(values, 20_000)[:4], [0, 1, 2, 3])
+    assert len(smallest(values, 20_000)) == 20_000

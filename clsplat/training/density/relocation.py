@@ -95,20 +95,22 @@ def plan_relocation(
     summary = splats.summary()
     sound = summary.some_finite()
     n = len(sound)
-    strength = np.where(sound, shape.opacity(summary.raw_opacity.astype(np.float64)), 0.0)
-    alive = strength > min_opacity
+    raw = np.where(sound, summary.raw_opacity, -np.inf)  # rises with the opacity
+    alive = np.ones(n, np.bool_)
+    faint = np.flatnonzero(raw < shape.raw_opacity(np.array(min_opacity)) + 0.01)  # the others are above it
+    alive[faint] = shape.opacity(raw[faint].astype(np.float64)) > min_opacity
     n_new = max(n, min(cap, math.ceil(growth * n - 1e-6)))  # 1.05 * 100 is a little above 105 in binary
     replacing = turnover > 0 and n_new == n
     if replacing:
-        alive[smallest(strength, int(turnover * n))] = False
+        alive[smallest(raw, int(turnover * n))] = False
     dead = np.flatnonzero(sound & ~alive)
     if not alive.any():
         alive, dead, n_new = sound, dead[:0], n
-    weakest = dead[smallest(strength[dead], int(limit * n))]
-    moving = np.sort(np.concatenate([np.flatnonzero(~sound), weakest]))
+    weakest = dead[smallest(raw[dead], int(limit * n))]
+    moving = np.sort(np.concatenate([np.flatnonzero(~sound), weakest]), kind="stable")  # merges two rising parts
 
     if gradient is None or not replacing:
-        weights = np.where(alive, strength, 0.0)
+        weights = np.where(alive, shape.opacity(summary.raw_opacity.astype(np.float64)), 0.0)
     else:
         weights = np.where(alive & np.isfinite(gradient), gradient, 0.0)
     drawn, order = _draw(weights if weights.any() else alive, len(moving) + n_new - n, rng)

@@ -19,6 +19,10 @@ from ...splats.optical_depth import finite_rows, opacity_names
 from ...splats.shapes import Shape
 from .edit import Indices
 
+# Number of values from which `smallest` estimates a bound, and the factor by which it estimates too many.
+_SAMPLE = 8192
+_MARGIN = 1.1
+
 
 @dataclass(frozen=True, slots=True)
 class Summary:
@@ -84,9 +88,27 @@ def smallest(values: Array, count: int) -> Indices:
 
     values : (N,) without NaN.
     """
-    if count <= 0 or not len(values):
+    count = min(count, len(values))
+    if count <= 0:
         return np.zeros(0, np.int64)
-    last = np.partition(values, min(count, len(values)) - 1)[min(count, len(values)) - 1]
-    chosen = values < last
-    chosen[np.flatnonzero(values == last)[: count - np.count_nonzero(chosen)]] = True
-    return np.flatnonzero(chosen)
+    among = _below_estimate(values, count)
+    found = values[among]
+    last = np.partition(found, count - 1)[count - 1]
+    chosen = found < last
+    chosen[np.flatnonzero(found == last)[: count - np.count_nonzero(chosen)]] = True
+    return among[chosen]
+
+
+def _below_estimate(values: Array, count: int) -> Indices:
+    """Return the indices of at least `count` values, in rising order, which include the `count` smallest ones.
+
+    A sample estimates the largest of them. A pass over all values that compares them with one number is several times
+    faster than a partition.
+    """
+    sample = values[:: max(len(values) // _SAMPLE, 1)]
+    rank = int(_MARGIN * len(sample) * count / len(values)) + _SAMPLE // 128
+    if rank < len(sample):
+        among = np.flatnonzero(values <= np.partition(sample, rank)[rank])
+        if len(among) >= count:
+            return among
+    return np.arange(len(values))
