@@ -9,11 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-
-
-def _text(value: object) -> str:
-    """Return a value as one short line."""
-    return " ".join(repr(value).split())[:60]
+from ..files.json_file import describe_any
 
 
 def is_rotation(matrix: NDArray[np.float64]) -> bool:
@@ -50,12 +46,12 @@ class Camera:
     ) -> None:
         for name, size in (("width", width), ("height", height)):
             if isinstance(size, bool) or not isinstance(size, Real) or not float(size).is_integer():
-                raise InputError(f"camera: {name} is {_text(size)}; expected a whole number of pixels")
+                raise InputError(f"camera: {name} is {describe_any(size)}; expected a whole number of pixels")
         if width < 1 or height < 1:
             raise InputError(f"camera: width x height is {width}x{height}; both must be at least 1")
         for name, real in (("fx", fx), ("fy", fy), ("cx", cx), ("cy", cy)):
             if isinstance(real, bool) or np.ndim(real) > 0 or not isinstance(real, Real | np.ndarray):
-                raise InputError(f"camera: {name} is {_text(real)}; expected a number of pixels")
+                raise InputError(f"camera: {name} is {describe_any(real)}; expected a number of pixels")
         intrinsics = np.array([fx, fy, cx, cy], dtype=np.float64)
         if not np.all(np.isfinite(intrinsics)) or fx <= 0 or fy <= 0:
             raise InputError(f"camera: fx={fx} fy={fy} cx={cx} cy={cy}; focal lengths must be above 0, all finite")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files.json_file import describe, to_real
+from ..files.json_file import describe_any, to_real
 from .table import MEASURED, Record
 
 # Values without which a run that did not fail has no place in tables and charts.
@@ -46,7 +46,7 @@ def parse_runs(text: str, file: Path) -> list[Record]:
             continue
         for name, value, expected in _faults(record):
             raise InputError(
-                f"{file}: line {number}: {name} is {_shown(value)}; expected {expected}: "
+                f"{file}: line {number}: {name} is {describe_any(value)}; expected {expected}: "
                 "remove the line, so that its run is repeated"
             )
         records.append(record)
@@ -107,12 +107,6 @@ def _is_curve(value: object) -> bool:
 def _or_none(field: _Field) -> _Field:
     expected, is_sound = field
     return f"{expected} or null", lambda value: value is None or is_sound(value)
-
-
-def _shown(value: object) -> str:
-    """Return a number, or a few words on any other value."""
-    number = to_real(value)
-    return f"{number:.6g}" if number is not None else describe(value)
 
 
 _Field = tuple[str, Callable[[Any], bool]]  # what a value must be, in words and as a test

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from .atomic import atomic_writer
 from .whole_file import read_whole
 
 MAX_NUMBER = 1e30  # numbers of files are smaller than this where float32 must store them
+_LONG_NUMBER = 10**16  # messages show shorter whole numbers with all digits
 
 
 def read_json(path: str | os.PathLike[str], expected: str) -> Any:
@@ -124,6 +126,21 @@ def describe(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return f"{value}"
     return "a number"
+
+
+def describe_any(value: object) -> str:
+    """Describe a value of any type in a few words, a number by its digits, for error messages.
+
+    None is null, as in the files that hold such values.
+    """
+    if isinstance(value, Real) and not isinstance(value, bool):
+        if not isinstance(value, int) or abs(value) < _LONG_NUMBER:
+            return f"{value}"
+        number = to_real(value)  # Python does not write numbers of thousands of digits
+        return f"{number:.6g}" if number is not None and math.isfinite(number) else "a number of hundreds of digits"
+    if value is None or isinstance(value, bool | str | list | dict):
+        return describe(value)
+    return f"a {type(value).__name__}"
 
 
 def to_real(value: object) -> float | None:

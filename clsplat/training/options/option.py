@@ -16,7 +16,7 @@ from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from ...errors import InputError, check_choice
-from ...files.json_file import describe, to_real
+from ...files.json_file import describe_any, to_real
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Option:
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(f"{self.name} {value}: must be finite{f' and {self.range}' if self.range else ''}")
         if not _fits(value, self.type):
-            raise InputError(f"{self.name} is {_described(value)}; expected {_expected(self.type)}")
+            raise InputError(f"{self.name} is {describe_any(value)}; expected {_expected(self.type)}")
         if self.range is not None and value is not None and not self.range.allows(value):
             raise InputError(f"{self.name} {value}: must be {self.range}")
 
@@ -109,7 +109,7 @@ class Option:
         """
         converted = tuple(value) if isinstance(value, list) else value
         if not _is_instance(converted, self.type):
-            raise InputError(f"config: {self.name} is {_described(value)}; expected {_expected(self.type)}")
+            raise InputError(f"config: {self.name} is {describe_any(value)}; expected {_expected(self.type)}")
         return converted
 
 
@@ -200,15 +200,6 @@ def _fits(value: Any, hint: Any) -> bool:
     if get_origin(hint) is tuple:
         return isinstance(value, tuple | list) and all(_fits(part, get_args(hint)[0]) for part in value)
     return to_real(value) is not None if hint is float else _is_instance(value, hint)  # `check` has refused NaN
-
-
-def _described(value: Any) -> str:
-    """Describe a value in a few words, a number by its digits."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return f"{value}"
-    if value is None or isinstance(value, bool | str | list | dict):
-        return describe(value)
-    return f"a {type(value).__name__}"
 
 
 def _expected(hint: Any) -> str:
