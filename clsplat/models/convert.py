@@ -30,6 +30,8 @@ from ..splats.splats import Splats
 from ..webpage.page import PageContent, write_web_page
 from .model import LoadedModel, model_at
 
+_SOME = 1000  # splats of a model that show whether it has nearest splats of a shape; all of them would take seconds
+
 
 @dataclass(frozen=True)
 class ConvertedModel:
@@ -255,8 +257,19 @@ def _as_shape(splats: Splats, target: str | None, suffix: str, approximate: bool
         return (splats if shapes is None else as_one_of(splats, shapes, holder)), False
     except InputError as error:
         if not approximate:
-            raise InputError(f"{error}; or --approximate") from None
+            nearest = "; or --approximate" if _has_nearest(splats, target or GAUSSIAN.name) else ""
+            raise InputError(f"{error}{nearest}") from None
     return nearest_of_shape(splats, target or GAUSSIAN.name)
+
+
+def _has_nearest(splats: Splats, shape: str) -> bool:
+    """Return whether another shape has nearest splats, by finding some: the reasons against it are of many kinds."""
+    some = splats.select(np.arange(0, len(splats), len(splats) // _SOME + 1))
+    try:
+        nearest_of_shape(some, shape)
+    except InputError:
+        return False
+    return True
 
 
 def _of_degree(splats: Splats, degree: int) -> Splats:

@@ -21,6 +21,7 @@ from clsplat.comparison.sweep_rows import point_rows
 from clsplat.device.device import Device
 from clsplat.errors import DeviceError, InputError
 from clsplat.evaluation.chart_style import INK, looks, shape_colour, shape_marker
+from clsplat.models.convert import convert_model
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
 from clsplat.splats import approximate
@@ -267,6 +268,26 @@ def test_a_shape_without_gaussians_has_no_equals(strange: None) -> None:
     assert np.ptp(near.log_scale - without.log_scale) < 1e-9
     assert 0.0 < float((near.log_scale - without.log_scale)[0, 0]) < 0.5
     assert [name for name, known in SHAPES.items() if not known.holds_gaussian()] == ["cosine"]
+
+
+def test_the_nearest_splats_are_offered_only_where_there_are_some(strange: None, tmp_path: Path) -> None:
+    core = {name: value for name, value in arrays().items() if name != "pinch"}
+    sides = {"skew": np.tile([0.0, 0.5, 0.0], (12, 1)), "opacity_minus_logit": core["opacity_logit"] + 1.0}
+    none = Splats("skew-normal", core | {"skew": sides["skew"]}, normalisation="none")
+    offered = []
+    for splats, target in (
+        (Splats("cosine", core), "gaussian"),  # its nearest Gaussians are known
+        (Splats("cosine", core), "student-t"),
+        (Splats("gaussian", core), "cosine"),  # no cosine splat is a Gaussian
+        (Splats("sided", core | sides), "gaussian"),  # it has more than one number of its own
+        (none, "gaussian"),  # its height changes with the view
+        (Splats("gaussian", core), "unknown"),
+    ):
+        splats.save(tmp_path / "from.ply")
+        with pytest.raises(InputError) as caught:
+            convert_model(tmp_path / "from.ply", tmp_path / "to.ply", target)
+        offered.append(str(caught.value).endswith("; or --approximate"))
+    assert offered == [True, True, False, False, False, False]
 
 
 def test_a_new_shape_of_the_package_without_bounds_has_nearest_gaussians(
