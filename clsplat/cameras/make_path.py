@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files.image_names import bare_name
+from ..files.json_file import describe_any, is_real, is_whole
 from ..splats.splats import Splats
 from .camera import Camera
 from .cameras_json import NamedCamera
@@ -39,7 +41,7 @@ class PathRequest:
 
     Raises
     ------
-    InputError : `frames` and `seconds` are both set, or a number is not above 0 and finite.
+    InputError : `frames` and `seconds` are both set, a value has another type, or a number is not above 0 and finite.
     """
 
     kind: str
@@ -53,9 +55,29 @@ class PathRequest:
     def __post_init__(self) -> None:
         if self.frames is not None and self.seconds is not None:
             raise InputError("camera path: give frames or seconds, not both")
+        self._check_types()
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"camera path: {name} {value}: must be above 0 and finite")
+        if self.frames is not None and self.frames < 1:
+            raise InputError(f"camera path: frames {self.frames}: must be at least 1")
+        if self.size is not None and min(self.size) < 1:
+            raise InputError("camera path: size {}x{}: must be at least 1x1".format(*self.size))
+
+    def _check_types(self) -> None:
+        """Raise InputError if a value has another type than it needs."""
+        texts = isinstance(self.keys, tuple | list) and all(isinstance(key, str) for key in self.keys)
+        whole = isinstance(self.size, tuple | list) and len(self.size) == 2 and all(map(is_whole, self.size))
+        for name, is_right, expected in (
+            ("kind", isinstance(self.kind, str | os.PathLike), f"{', '.join(AROUND)}, {BETWEEN} or a file's name"),
+            ("keys", self.keys is None or texts, "names of cameras in a tuple"),
+            ("frames", self.frames is None or is_whole(self.frames), "a whole number"),
+            ("seconds", self.seconds is None or is_real(self.seconds), "a number"),
+            ("fps", self.fps is None or is_real(self.fps), "a number"),
+            ("size", self.size is None or whole, "two whole numbers of pixels, (width, height)"),
+        ):
+            if not is_right:
+                raise InputError(f"camera path: {name} is {describe_any(getattr(self, name))}; expected {expected}")
 
     def frame_count(self, fps: float) -> int | None:
         """Return the number of frames at a frame rate; None if the request sets neither frames nor seconds.

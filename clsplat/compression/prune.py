@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
+from ..files.json_file import describe_any, is_real
 from ..rendering.renderer import Renderer
 from ..scenes.read_view import keep_photos
 from ..scenes.scene import View
@@ -92,6 +93,14 @@ class Validation:
         ]
 
 
+def check_tolerance(tolerance: float) -> None:
+    """Raise InputError unless a tolerance is a number of at least 0 dB."""
+    if not is_real(tolerance):
+        raise InputError(f"tolerance is {describe_any(tolerance)}; expected a number of dB")
+    if not tolerance >= 0:
+        raise InputError(f"tolerance {tolerance}: must be at least 0 dB")
+
+
 def prune(
     splats: Splats,
     views: Sequence[View],
@@ -118,8 +127,7 @@ def prune(
     """
     if not len(splats):
         raise InputError("prune: the model has no splats")
-    if not tolerance >= 0:
-        raise InputError(f"tolerance {tolerance}: must be at least 0 dB")
+    check_tolerance(tolerance)
     views_before = validation.per_view(splats)
 
     def surely(candidate: Splats) -> float:

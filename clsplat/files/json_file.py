@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +133,7 @@ def describe_any(value: object) -> str:
 
     None is null, as in the files that hold such values.
     """
-    if isinstance(value, Real) and not isinstance(value, bool):
+    if is_real(value):
         if not isinstance(value, int) or abs(value) < _LONG_NUMBER:
             return f"{value}"
         number = to_real(value)  # Python does not write numbers of thousands of digits
@@ -141,6 +141,16 @@ def describe_any(value: object) -> str:
     if value is None or isinstance(value, bool | str | list | dict):
         return describe(value)
     return f"a {type(value).__name__}"
+
+
+def is_real(value: object) -> bool:
+    """Return whether a value of a Python program is a real number; NumPy's numbers are, true and false are not."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def is_whole(value: object) -> bool:
+    """Return whether a value of a Python program is an integer; NumPy's integers are, true and false are not."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def to_real(value: object) -> float | None:

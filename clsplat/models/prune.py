@@ -7,11 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..compression.prune import SHARES, Pruned, Validation, prune
+from ..compression.prune import SHARES, Pruned, Validation, check_tolerance, prune
 from ..compression.prune_and_refine import prune_in_rounds
 from ..device.device import open_device
 from ..errors import InputError, OutputError
 from ..files.existing import refuse_existing
+from ..files.json_file import describe_any, is_whole
 from ..rendering.renderer import Renderer
 from ..scenes.split import hold_out
 from ..splats.formats.any_file import PLY_ENDING, stored_bytes
@@ -70,9 +71,14 @@ def prune_model(
 
     Raises
     ------
-    InputError : the model is empty, or the model or the scene cannot be read.
+    InputError : a number is below 0 or none at all, or the model is empty. Or the model or the scene cannot be read.
     OutputError : the file exists or cannot be written.
     """
+    check_tolerance(tolerance)
+    if not is_whole(iterations):
+        raise InputError(f"iterations is {describe_any(iterations)}; expected a whole number")
+    if iterations < 0:
+        raise InputError(f"iterations {iterations}: must be at least 0")
     output = Path(output)
     if output.is_dir():
         raise OutputError(f"{output}: is a folder: name the PLY file to write")

@@ -13,6 +13,7 @@ from ..device.several import open_devices
 from ..device.specs import first_device
 from ..errors import InputError
 from ..evaluation.evaluate import Evaluation, evaluate
+from ..files.json_file import describe_any
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
 from ..splats.fields import Group
@@ -69,6 +70,8 @@ def train(
     """
     if isinstance(scene, str | os.PathLike):
         raise InputError(f"{scene}: train takes a scene, not its path: clsplat.load_scene reads it")
+    if not isinstance(scene, Scene):
+        raise InputError(f"scene is {describe_any(scene)}: train takes a scene: clsplat.load_scene reads one")
     if not isinstance(config, TrainConfig | None):
         raise InputError(f"config is a {type(config).__name__}: train takes options as clsplat.TrainConfig(...)")
     config = config or TrainConfig()

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera, write_cameras
+from clsplat.cameras.make_path import PathRequest
 from clsplat.cameras.path import CameraPath, path_of, path_text, read_path, write_path
 from clsplat.errors import InputError
 
@@ -158,3 +159,33 @@ def test_frames_of_two_sizes_are_refused() -> None:
     first = some_cameras(1)[0]
     with pytest.raises(InputError, match="frame 1 is 64x36"):
         path_text(CameraPath((first, first.resized(64, 36))))
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"kind": 5}, "kind is 5; expected orbit, ellipse, spiral, interpolate or a file's name"),
+        ({"keys": "ab"}, "keys is the text 'ab'; expected names of cameras in a tuple"),
+        ({"keys": (1, 2)}, "keys is a tuple; expected names"),
+        ({"frames": "a"}, "frames is the text 'a'; expected a whole number"),
+        ({"frames": 2.5}, "frames is 2.5; expected a whole number"),
+        ({"frames": 0}, "frames 0: must be at least 1"),
+        ({"seconds": "a"}, "seconds is the text 'a'; expected a number"),
+        ({"seconds": 0.0}, "seconds 0.0: must be above 0 and finite"),
+        ({"fps": [1]}, "fps is a list; expected a number"),
+        ({"size": 5}, "size is 5; expected two whole numbers of pixels, (width, height)"),
+        ({"size": "40x30"}, "size is the text '40x30'; expected two"),
+        ({"size": (40,)}, "size is a tuple; expected two"),
+        ({"size": (40, 30.5)}, "size is a tuple; expected two"),
+        ({"size": (40, 0)}, "size 40x0: must be at least 1x1"),
+    ],
+)
+def test_a_wrong_value_of_a_request_is_named(values: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        PathRequest(**{"kind": "orbit", **values})
+    assert str(caught.value).startswith(f"camera path: {said}")
+
+
+def test_numbers_of_numpy_make_a_request() -> None:
+    request = PathRequest("orbit", frames=np.int64(2), fps=np.float32(5), size=(np.int32(4), 3))
+    assert request.frame_count(30) == 2

@@ -223,6 +223,22 @@ def test_a_model_is_pruned_over_its_background(
     assert pruned.before == judges[0].psnr(Splats.load(ModelFolder(folder).latest_ply()[0]))
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("tolerance", "a", "tolerance is the text 'a'; expected a number of dB"),
+        ("tolerance", None, "tolerance is null; expected a number of dB"),
+        ("tolerance", float("nan"), "tolerance nan: must be at least 0 dB"),
+        ("iterations", 1.5, "iterations is 1.5; expected a whole number"),
+        ("iterations", -1, "iterations -1: must be at least 0"),
+    ],
+)
+def test_a_wrong_number_is_named_before_the_model_is_read(tmp_path: Path, name: str, value: Any, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        prune_model(tmp_path / "none", tmp_path / "small.ply", **{name: value})
+    assert str(caught.value) == said
+
+
 def test_bad_input(splats: Splats, scene: Scene, validation: Validation) -> None:
     with pytest.raises(InputError, match="tolerance -1"):
         prune(splats, scene.train, validation, -1)

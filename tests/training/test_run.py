@@ -267,6 +267,11 @@ def test_the_path_of_a_scene_is_not_a_scene(tmp_path: Path) -> None:
         train(str(tmp_path))  # type: ignore[arg-type]
 
 
+def test_nothing_is_not_a_scene() -> None:
+    with pytest.raises(InputError, match=r"scene is null: train takes a scene: clsplat\.load_scene reads one"):
+        train(None)  # type: ignore[arg-type]
+
+
 def test_a_dictionary_is_not_a_config(scene: Scene) -> None:
     with pytest.raises(InputError, match=r"config is a dict: train takes options as clsplat\.TrainConfig"):
         train(scene, {"iterations": 5})  # type: ignore[arg-type]
