@@ -58,7 +58,7 @@ def compare(
     output : folder of runs.jsonl, table.md and results.json, which are also written after Ctrl-C.
     common : options of all methods, by the names of TrainConfig.
     lengths : iterations of the runs; without any, those of `common` or the default.
-    save_models : keep the splats of each run in `output`/models.
+    save_models : keep the splats of each run in `output`/models. No two runs have one name there.
     curve : number of measurements of the test views along each run; a run without a curve is repeated.
     repeat : how often to train the first seed: on one device the splats have the same bits each time.
     extra : more keys of each record.
@@ -142,8 +142,9 @@ def _missing(
                 continue
             run = Run(scene.name, label, config, number, len(configs), again)
             record: Record = {"scene": identity, "system": label, "config": config.to_json(), "repeat": again}
-            ply = folder / MODELS / f"{run.file_name}.ply" if save_models else None
-            scratch = real_path(folder) / UNFINISHED / f"{run.file_name}-{key_digest(record)}"
+            digits = key_digest(record)
+            ply = folder / MODELS / f"{run.model_name(len(scene.test))}-{digits}.ply" if save_models else None
+            scratch = real_path(folder) / UNFINISHED / f"{run.file_name}-{digits}"
             yield PlannedRun(
                 run,
                 record,

@@ -44,6 +44,10 @@ class Run:
         """Name of the run's files, without their suffix: scene, system, cap, seed and repeat."""
         return short_name(f"{self.scene}-{self.stem}", _LONGEST_NAME)
 
+    def model_name(self, test_views: int) -> str:
+        """Return the name of the run's model, without digits and a suffix: that of its files, length and test views."""
+        return f"{self.file_name}-iterations{self.config.iterations}-test{test_views}"
+
     @property
     def stem(self) -> str:
         """The part of file names that differs between runs on a scene: system, cap, seed and repeat."""

@@ -54,7 +54,7 @@ def test_a_run_is_the_training_it_names(scene: Scene, compared: Path) -> None:
     assert record["scene"] == scene_identity(scene)
     assert record["splats"] == len(model.splats) <= CAP
     assert record["parameters"] == len(model.splats) * (3 + 4 + 3 + 1 + 12)
-    file = compared / "models" / f"yard-gaussian-cap{CAP}-seed1.ply"
+    (file,) = (compared / "models").glob(f"yard-gaussian-cap{CAP}-seed1-iterations20-test{len(scene.test)}-*.ply")
     assert record["bytes"] == file.stat().st_size
     assert (Splats.load(file).mean == model.splats.mean).all()
     assert record["finite"]
@@ -179,6 +179,21 @@ def test_a_scene_with_the_longest_name_keeps_its_models(scene: Scene, tmp_path: 
     models = list((tmp_path / "models").iterdir())
     assert len(models) == 2
     assert all(len(Splats.load(model)) > 0 for model in models)
+
+
+def test_no_model_replaces_that_of_another_run(scene: Scene, tmp_path: Path) -> None:
+    """Runs of other lengths, other test views, and photos of other contents have models of their own."""
+    other = replace(scene, views=[view for view in scene.views if view != scene.train[0]])
+    fewer = replace(scene, test_names=scene.test_names - {scene.test[0].name})
+    swapped = replace(scene, test_names=scene.test_names - {scene.test[0].name} | {scene.train[0].name})
+    systems, scenes = parse_methods("gaussian"), [scene, other, fewer, swapped]
+    compare(scenes, systems, tmp_path, [CAP], [0], SHORT, lengths=[2, 4], save_models=True)
+    names = sorted(path.name for path in (tmp_path / "models").iterdir())
+    assert len(names) == len(done(tmp_path)) == 8
+    for length in (2, 4):
+        begin = f"yard-gaussian-cap{CAP}-seed0-iterations{length}-test"
+        assert len([name for name in names if name.startswith(f"{begin}{len(scene.test)}-")]) == 3
+        assert len([name for name in names if name.startswith(f"{begin}{len(scene.test) - 1}-")]) == 1
 
 
 def test_a_curve_is_measured_along_the_run(scene: Scene, tmp_path: Path) -> None:
