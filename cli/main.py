@@ -15,6 +15,7 @@ import click
 from clsplat import __version__
 from clsplat.errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, ClsplatError, Remedy
 from clsplat.files import stop_signals
+from clsplat.files.standard_streams import drop_unread
 
 from .command import nearest_command
 from .help_layout import write_examples
@@ -62,8 +63,14 @@ EXIT_CODES = (
     ("1", "An error, in one line on standard error."),
     ("2", "A wrong command line."),
     ("130", "Stopped by Ctrl-C. Another signal: 128 plus its number."),
+    ("141", "The reader of the output, such as head, has ended."),
 )
+_READER_GONE = 128 + 13  # the code of a Unix tool that SIGPIPE ends
 _LONGEST_WORD = 400  # characters of a word that a message shows in full; a path may be that long
+
+
+class _ReaderGone(Exception):
+    """The reader of a standard stream has ended, as `head` does after its last line."""
 
 
 class Commands(click.Group):
@@ -111,6 +118,8 @@ class Commands(click.Group):
             return super().make_context(*args, **extra)
         except KeyboardInterrupt:  # click would write an empty line before the message
             raise click.Abort from None
+        except BrokenPipeError:  # click would exit with code 1
+            raise _ReaderGone from None
 
     def invoke(self, ctx: click.Context) -> Any:
         with warnings.catch_warnings():
@@ -122,6 +131,8 @@ class Commands(click.Group):
             except ClsplatError as error:
                 _fail(ctx, error.for_command(self._options(ctx)))
             except Exception as error:
+                if isinstance(error, BrokenPipeError) and _is_of_echo(error):
+                    raise _ReaderGone from None
                 known = _known_failure(error)
                 if known is None:
                     raise
@@ -151,6 +162,9 @@ class Commands(click.Group):
         except click.Abort:
             click.echo(f"error: {stop_signals.reason()}", err=True)
             code = stop_signals.exit_code()
+        except _ReaderGone:
+            drop_unread()
+            code = _READER_GONE
         except OSError as error:  # of the text of --help or --version
             click.echo(f"error: {_of_system(error)}", err=True)
             code = 1
@@ -182,7 +196,7 @@ def _known_failure(error: Exception) -> ClsplatError | None:
     """Return the error of clsplat for one from outside. None for a bug in clsplat."""
     if isinstance(error, MemoryError):
         return ClsplatError("out of memory", FEWER_SPLATS, SMALLER_IMAGES, Remedy("close other programs"))
-    if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+    if isinstance(error, OSError):
         return _of_system(error)
     cl = sys.modules.get("pyopencl")  # if it is not loaded, the error is not from OpenCL
     if cl is None or not isinstance(error, cl.Error):
@@ -198,10 +212,15 @@ def _of_system(error: OSError) -> ClsplatError:
     """Return the error of clsplat for one of the system."""
     if error.filename:
         return ClsplatError(f"{error.filename}: {error.strerror}")
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    if frames and frames[-1].f_code is click.echo.__code__:
+    if _is_of_echo(error):
         return ClsplatError(f"standard output: cannot be written ({error.strerror}): send it elsewhere")
     return ClsplatError(str(error))
+
+
+def _is_of_echo(error: OSError) -> bool:
+    """Return whether an error comes from writing a text to a standard stream."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return bool(frames) and frames[-1].f_code is click.echo.__code__
 
 
 def _show_warning(

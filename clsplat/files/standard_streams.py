@@ -1,4 +1,4 @@
-"""Standard streams that the caller closed."""
+"""Standard streams that the caller closed, or whose reader has ended."""
 
 from __future__ import annotations
 
@@ -19,3 +19,17 @@ def open_closed_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # gets the smallest free number
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
+
+
+def drop_unread() -> None:
+    """Send the rest of each standard stream whose reader has ended to the null device.
+
+    Otherwise Python writes what is in the buffer once more when it ends, and exits with code 120.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, stream.fileno())
+            os.close(null)
