@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,29 +45,35 @@ def list_images(home: Path, suffixes: Collection[str]) -> Listing:
 
     Scenes, models and comparisons that clsplat wrote are left out, and so are other scenes. They are known by their
     contents, not by their names. Renders are left out beside photos; a folder with nothing else is taken as it is.
+    A warning counts the folders that this user may not read.
     """
     names: list[str] = []
     outputs: list[str] = []
     scenes: list[str] = []
-    for folder, folders, files in os.walk(home):
+    closed: list[OSError] = []
+    for folder, folders, files in os.walk(home, onerror=closed.append):
         below = Path(folder).relative_to(home)
         kept = []
         for name in sorted(folders):
             path, shown = Path(folder) / name, (below / name).as_posix()
             if name.startswith(".") or (below == Path() and name == MASK_FOLDER):
                 continue
-            if is_output(path):
-                outputs.append(shown)
-            elif is_posed(path):
-                scenes.append(shown)
-            else:
-                kept.append(name)
+            try:
+                if is_output(path):
+                    outputs.append(shown)
+                elif is_posed(path):
+                    scenes.append(shown)
+                else:
+                    kept.append(name)
+            except PermissionError as error:
+                closed.append(PermissionError(error.errno, error.strerror, str(path)))
         folders[:] = kept
         names += [
             (below / name).as_posix()
             for name in files
             if not name.startswith(".") and Path(name).suffix.lower() in suffixes
         ]
+    _warn_of_closed(home, closed)
     known = {part for name in names for part in (name, bare_name(name))}
     names = [name for name in names if not (name.lower().endswith(BESIDE) and name[: -len(BESIDE)] in known)]
     photos = [name for name in names if not (name.lower().endswith(".png") and is_render(home / name))]
@@ -75,6 +82,18 @@ def list_images(home: Path, suffixes: Collection[str]) -> Listing:
         outputs.append(f"{renders} render{'s' if renders > 1 else ''}")
         names = photos
     return Listing(tuple(sorted(names)), tuple(outputs), tuple(scenes))
+
+
+def _warn_of_closed(home: Path, errors: Collection[OSError]) -> None:
+    """Warn of folders that this user may not read. Others, such as those of a process that has ended, are gone."""
+    closed = [str(error.filename) for error in errors if isinstance(error, PermissionError)]
+    if closed:
+        one = len(closed) == 1
+        warnings.warn(
+            f"{home}: {len(closed)} folder{'' if one else 's'} cannot be read and {'is' if one else 'are'} left out, "
+            f"such as {closed[0]}: check the permissions if photos are there",
+            stacklevel=3,
+        )
 
 
 def is_output(folder: Path) -> bool:

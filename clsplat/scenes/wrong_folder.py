@@ -137,7 +137,10 @@ def _folders_below(path: Path) -> Iterator[tuple[Path, bool]]:
             looked += 1
             if name.startswith(".") or looked > _MAX_FOLDERS:
                 continue
-            posed = is_posed(Path(folder) / name)
+            try:
+                posed = is_posed(Path(folder) / name)
+            except PermissionError:  # a user does not mean a folder that is closed to them
+                continue
             yield Path(folder) / name, posed
             if not posed:
                 kept.append(name)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from small_scene import write_garden
 from clsplat.errors import InputError
 from clsplat.files.image_names import IMAGE_SUFFIXES
 from clsplat.files.images import is_render, write_grey16, write_png
+from clsplat.scenes import photo_listing, wrong_folder
 from clsplat.scenes.photo_listing import is_posed, list_images
 from clsplat.scenes.reconstruct.photo_files import find_photos, fingerprint, left_out_below
 
@@ -98,3 +101,31 @@ def test_masks_and_hidden_files_are_no_photos(photos: Path) -> None:
     for name in ("masks/a.png", ".cache/a.png", ".a.png", "day/masks/d.png"):
         write_png(photos / name, PIXELS)
     assert list_images(photos, IMAGE_SUFFIXES).names == ("a.png", "b.png", "day/c.png", "day/masks/d.png")
+
+
+def test_folders_that_cannot_be_read_are_left_out_with_one_warning(
+    photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Root reads everything, so the system's answer is a pretended one: of a folder, and of a file in another."""
+    for name in ("closed", "locked"):
+        (photos / name).mkdir()
+
+    def of_user(path: Path) -> bool:
+        if path.name == "closed":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path / "reconstruct.json"))
+        return is_posed(path)
+
+    def scan(path: str) -> object:
+        if Path(path).name == "locked":
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        return listed(path)
+
+    listed = os.scandir
+    monkeypatch.setattr(photo_listing, "is_posed", of_user)
+    monkeypatch.setattr(os, "scandir", scan)
+    monkeypatch.setattr(wrong_folder, "is_posed", of_user)
+    with pytest.warns(UserWarning, match="photos: 2 folders cannot be read and are left out, such as") as told:
+        assert list_images(photos, IMAGE_SUFFIXES).names == NAMES
+    assert len(told) == 1
+    assert str(photos / "closed:") in str(told[0].message)
+    assert wrong_folder.scenes_below(photos) == []
