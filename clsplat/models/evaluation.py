@@ -35,6 +35,7 @@ from .measurements import ModelEvaluation, ViewRecorder
 from .model import LoadedModel, SceneChoice, load_model, model_at
 
 REPORT = "report.html"
+_ONE_SCENE = "compare models of one scene, or measure them without a common report"
 UNIT_RANGE_PROTOCOL = "3dgs"  # 3DGS's script passes images in 0..1 to LPIPS
 
 
@@ -121,7 +122,7 @@ def evaluate_models(
 
     A model is also measured if its result files cannot be written; see `ModelEvaluation.write_error`. If the caller
     named other places, with `comparison` or `numbers`, that is only a warning. A warning says that models were measured
-    on different views. With `comparison`, that is an InputError.
+    on different views. With `comparison`, that is an InputError before anything is measured.
 
     Parameters
     ----------
@@ -136,15 +137,19 @@ def evaluate_models(
     refuse_existing([path for path in (comparison, numbers) if path is not None], overwrite)
     write = options.report and comparison is None
     evaluator = Evaluator(options, Renderer(device), write_reports=write, overwrite=overwrite)
+    if comparison is not None and len(paths) > 1:
+        first, *others = ((path, evaluator.view_sizes(load_model(path, iteration))) for path in paths)
+        for other in others:
+            if not _are_equal_views(first[1], other[1]):
+                raise InputError(_different(first[0], other[0], _ONE_SCENE))
     measured = []
     for path, name in zip(paths, names, strict=True):
         folder = renders / name if renders is not None and len(paths) > 1 else renders
         measured.append(evaluator(load_model(path, iteration), folder, progress))
-        if not _on_equal_views(measured[0], measured[-1]):
-            differ = f"{path} and {paths[0]} are measured on different views or sizes"
-            if comparison is not None:
-                raise InputError(f"{differ}: compare models of one scene, or measure them without a common report")
-            warnings.warn(f"{differ}: do not compare their numbers", stacklevel=2)
+        if not _are_equal_views(measured[0].view_sizes, measured[-1].view_sizes):
+            if comparison is not None:  # a photo has become unreadable meanwhile
+                raise InputError(_different(paths[0], path, _ONE_SCENE))
+            warnings.warn(_different(paths[0], path, "do not compare their numbers"), stacklevel=2)
     try:
         if numbers is not None:
             entries = zip(paths, measured, strict=True)
@@ -218,6 +223,16 @@ class Evaluator:
         evaluation = ModelEvaluation(model, scene, result, per_view, recorder.images)
         return evaluation if model.folder is None else self._written(evaluation, model.folder)
 
+    def view_sizes(self, model: LoadedModel) -> dict[str, tuple[int, int]]:
+        """Return (width, height) [px] of the views of a model to measure, by name. No photo is decoded.
+
+        Raises
+        ------
+        InputError : the scene cannot be read, or has no such views.
+        """
+        views = self._views_of(model.load_scene(self.options.scene, check=False), model)
+        return {view.name: (view.camera.width, view.camera.height) for view in views}
+
     def _views_of(self, scene: Scene, model: LoadedModel) -> list[View]:
         """Return the views to measure. Raise InputError if there are none."""
         view_set = self.options.view_set
@@ -288,11 +303,14 @@ class Evaluator:
         return replace(evaluation, report=report)
 
 
-def _on_equal_views(one: ModelEvaluation, other: ModelEvaluation) -> bool:
-    """Return whether two models were measured on views of equal names and sizes."""
-    sizes, others = one.view_sizes, other.view_sizes
+def _are_equal_views(sizes: Mapping[str, tuple[int, int]], others: Mapping[str, tuple[int, int]]) -> bool:
+    """Return whether the views of two models have equal names and sizes."""
     named = match_names(list(sizes), list(others))
     return named is not None and all(sizes[named[name]] == size for name, size in others.items())
+
+
+def _different(first: Path, other: Path, remedy: str) -> str:
+    return f"{other} and {first} are measured on different views or sizes: {remedy}"
 
 
 def _add_entry(path: Path, key: str, entry: Mapping[str, Any]) -> None:

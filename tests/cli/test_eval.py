@@ -103,6 +103,18 @@ def test_models_of_different_views_are_not_compared_in_silence(model: Path, scen
     assert f"warning: {said}" in run(*both).stderr
 
 
+def test_models_of_different_views_are_refused_before_they_are_measured(
+    model: Path, scene: Path, tmp_path: Path
+) -> None:
+    models = tmp_path / "first", tmp_path / "other"
+    shutil.copytree(model, models[0], ignore=shutil.ignore_patterns("*.html", "results.json", "per_view.json"))
+    clsplat("train", scene, "-m", models[1], "-r", 2, "--eval", "--iterations", "2", "--cap-max", "50", "-q")
+    said = error_of("eval", *models, "--report", tmp_path / "r.html")
+    assert f"{models[1]} and {models[0]} are measured on different views or sizes: compare models of one scene" in said
+    assert not [path for path in models if (path / "results.json").exists()]
+    assert not (tmp_path / "r.html").exists()
+
+
 # --- files of splats ---------------------------------------------------------------------------
 
 
