@@ -218,6 +218,20 @@ def test_a_folder_that_cannot_be_written_is_replaced(tmp_path: Path) -> None:
         in_folder(place / "run", lambda folder: folder, keep=True)
 
 
+def test_a_folder_for_runs_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    """Root can write everywhere, so a file is in the way: in place of the folder, and above it."""
+    (tmp_path / UNFINISHED).touch()
+    for place, why in ((tmp_path / UNFINISHED, "File exists"), (tmp_path / UNFINISHED / "runs", "Not a directory")):
+        with pytest.raises(OutputError) as caught:
+            marked(place)
+        assert str(caught.value) == f"{place}: cannot be written ({why}); check rights and space"
+    place = tmp_path / "other"
+    (place / MARK / "in the way").mkdir(parents=True)
+    marked(place)
+    unmark(place)
+    assert (place / MARK).is_dir(), "a folder that is not empty stays"
+
+
 def test_scenes_are_read_once_in_a_row() -> None:
     read: list[str] = []
 
