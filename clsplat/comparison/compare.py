@@ -10,7 +10,7 @@ from typing import Any
 
 from ..cluster.job import Job
 from ..device.device import open_device
-from ..errors import InputError
+from ..errors import InputError, OutputError
 from ..files.atomic import atomic_writer
 from ..files.json_file import write_json
 from ..files.lock import folder_lock
@@ -69,6 +69,7 @@ def compare(
     Warns
     -----
     UserWarning : a change of a method has no effect in any of its runs, or rows in `output` are of an older version.
+        Or all runs are finished, and the table cannot be written again.
 
     Returns
     -------
@@ -96,12 +97,18 @@ def compare(
     ]
     refuse_foreign(folder, (TABLE, RESULTS, MODELS))
     runs = RunFile(folder)
+    before = list(runs.records)
     with folder_lock(folder):
         try:
             plan = _missing(scenes, methods, configs, runs, folder, save_models, curve, progress)
             do_runs(plan, runs, folder / UNFINISHED, cluster, on_run, extra)
         finally:
-            write_table(folder, runs.records)
+            try:
+                write_table(folder, runs.records)
+            except OutputError as error:
+                if runs.records != before:
+                    raise
+                warnings.warn(f"{error}; the table there is not written again", stacklevel=2)
     return runs.records
 
 

@@ -18,7 +18,7 @@ from clsplat.comparison.methods import parse_methods
 from clsplat.comparison.runs import Run
 from clsplat.comparison.scene_identity import scene_identity
 from clsplat.comparison.table import HEAD, MEASURED, Record, cells, markdown, notes, repeats, summarise
-from clsplat.errors import InputError, TrainingError
+from clsplat.errors import InputError, OutputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
@@ -170,6 +170,21 @@ def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp
     assert [record["system"] for record in records] == ["gaussian", "default", "gaussian:opacity_lr=0.02"]
     compare([scene], systems, tmp_path, [CAP], [0], SHORT)
     assert len(counted) == 4
+
+
+def test_a_finished_comparison_that_cannot_be_written_is_returned(
+    scene: Scene, tmp_path: Path, counted: list[tuple[str, int, int]]
+) -> None:
+    """As in a folder that is read-only. Root writes there, too, so a folder is in the place of the table."""
+    systems = parse_methods("gaussian")
+    records = compare([scene], systems, tmp_path, [CAP], [0], SHORT)
+    (tmp_path / "table.md").unlink()
+    (tmp_path / "table.md").mkdir()
+    with pytest.warns(UserWarning, match=r"table\.md: cannot be written .*the table there is not written again"):
+        assert compare([scene], systems, tmp_path, [CAP], [0], SHORT) == records
+    with pytest.raises(OutputError, match=r"table\.md: cannot be written"):
+        compare([scene], systems, tmp_path, [CAP], [1], SHORT)
+    assert len(counted) == len(done(tmp_path)) == 2
 
 
 def test_a_scene_with_the_longest_name_keeps_its_models(scene: Scene, tmp_path: Path) -> None:
