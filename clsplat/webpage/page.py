@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +22,7 @@ from ..files.file_names import printable
 from ..files.html_page import escape, package_text
 from ..splats.color import BLACK, Color
 from ..splats.convert import as_one_of
-from ..splats.formats.page_payload import PAGE_SHAPES, PRECISIONS, pack
+from ..splats.formats.page_payload import HUGE, PAGE_SHAPES, PRECISIONS, clipped_sizes, pack
 from ..splats.splats import Splats
 
 _TOUR, _TOUR_FPS = 24, 0.8  # keys of the tour around the scene, and how many of them pass in a second
@@ -71,6 +73,10 @@ def write_web_page(
 
     precision : "compact" or "full" (page_payload.py).
 
+    Warns
+    -----
+    UserWarning : "compact" draws enormous splats smaller than they are.
+
     Raises
     ------
     InputError : there is no splat, or the precision is unknown. OutputError : the file cannot be written.
@@ -89,6 +95,13 @@ def page_text(splats: Splats, content: PageContent, precision: str = PRECISIONS[
         raise InputError("the model has no splats to show; train it first")
     if splats.shape not in PAGE_SHAPES:
         raise InputError(f"a page draws {_DRAWN} splats, not {splats.shape}; see `as_drawn`")
+    if precision != "full" and (clipped := clipped_sizes(splats.stored())):
+        warnings.warn(
+            f"{clipped} splat{'s are' if clipped > 1 else ' is'} more than {math.exp(HUGE):.0f} times as large as the "
+            f"median, and the page draws {'them' if clipped > 1 else 'it'} smaller: "
+            'remove such splats, or choose the precision "full"',
+            stacklevel=2,
+        )
     payload = pack(splats.stored(), precision)
     cameras = [entry.camera for entry in content.cameras]
     tour = content.path or CameraPath(tuple(ellipse(splats, cameras, _TOUR)), _TOUR_FPS, closed=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -91,3 +92,22 @@ def test_bad_content_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"x\.html: the model has no splats to show"):
         write_web_page(tmp_path / "x.html", splats(0), PageContent("scene"))
     assert not list(tmp_path.iterdir())
+
+
+def test_splats_that_the_page_draws_smaller_are_counted(tmp_path: Path) -> None:
+    """Those that no image shows, and those at the limit, do not count. The full precision keeps all sizes."""
+    arrays = random_model(SKEW_NORMAL, 40, 1, dead=0)
+    arrays["log_scale"][:] = -3.0
+    arrays["opacity_logit"][:5] = [4.0, 4.0, -8.0, 4.0, 4.0]
+    arrays["log_scale"][:5] = [[8.0, -3.0, -3.0], [9.0, 9.0, 9.0], [9.0, 9.0, 9.0], [7.0, 7.0, 7.0], [6.0, 7.0, 6.0]]
+    some = Splats("skew-normal", arrays)
+    with pytest.warns(UserWarning, match="^2 splats are more than 22026 times as large as the median, ") as told:
+        write_web_page(tmp_path / "a.html", some, PageContent("scene"))
+    assert len(told) == 1
+    drawn = Splats.load(tmp_path / "a.html").log_scale[:5].max(axis=1)
+    np.testing.assert_allclose(drawn, [7.0, 7.0, 7.0, 7.0, 7.0], atol=0.02)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_web_page(tmp_path / "b.html", some, PageContent("scene"), "full")
+        write_web_page(tmp_path / "c.html", some.select(np.arange(2, 40)), PageContent("scene"))
+    assert Splats.load(tmp_path / "b.html").log_scale[1].max() == 9.0

@@ -49,7 +49,8 @@ _OPEN, _CLOSE = b'<script id="payload" type="text/plain">', b"</script>"
 _MAX_TEXT = 1 << 16  # bytes of the JSON text
 _MAX_RATIO = 1100  # of a gzip stream; above its limit, 1032
 _FLAT = 20.0  # a scale that is e^20 times smaller than the largest one might as well be 0
-_HUGE = 10.0  # a scale that is e^10 times larger than the median is that of a stray splat: nobody sees where it ends
+HUGE = 10.0  # a scale that is e^10 times larger than the median is that of a stray splat: nobody sees where it ends
+_MIN_ALPHA = 1.0 / 255.0  # no image shows a splat of less opacity
 _GZIP = 31  # of zlib's window: with the header of gzip
 _LEVEL = 6
 
@@ -112,6 +113,16 @@ def pack(splats: StoredSplats, precision: str = PRECISIONS[0]) -> bytes:
     ).encode()
     # No time in the header: equal models give equal bytes.
     return gzip.compress(struct.pack("<I", len(text)) + text + b"".join(parts), _LEVEL, mtime=0)
+
+
+def clipped_sizes(splats: StoredSplats) -> int:
+    """Return the number of splats that "compact" draws smaller than they are, without those that nobody sees."""
+    log_scale = splats.arrays["log_scale"].astype(np.float64)
+    if not len(log_scale):
+        return 0
+    clipped = np.any(log_scale > _largest(log_scale), axis=1)
+    seen = GAUSSIAN.opacity(splats.arrays["opacity_logit"].astype(np.float64)) >= _MIN_ALPHA
+    return int(np.count_nonzero(clipped & seen))
 
 
 def read_page(path: str | os.PathLike[str]) -> StoredSplats:
@@ -259,10 +270,14 @@ def _range(column: _Column, values: Array) -> dict[str, list[float]]:
     high = values.max(axis=0)
     low = values.min(axis=0)
     if column.name == "log_scale":
-        # A stray splat must not clip all others.
-        high = np.minimum(high, np.median(values, axis=0) + _HUGE)
+        high = np.minimum(high, _largest(values))
         low = np.maximum(low, high - _FLAT)
     return {"low": low.tolist(), "high": high.tolist()}
+
+
+def _largest(log_scale: Array) -> DoubleArray:
+    """Return the largest log scale of each axis that "compact" keeps, (3,): a stray splat must not clip all others."""
+    return np.asarray(np.median(log_scale, axis=0) + HUGE)
 
 
 def _numbers(entry: Mapping[str, Any], values: Array) -> NDArray[np.uint32]:
