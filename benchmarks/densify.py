@@ -154,11 +154,16 @@ def random_splats(shape: Shape, n: int, sh_degree: int) -> tuple[dict[str, np.nd
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return the results as a Markdown table."""
+    """Return the last result of each case on each processor, as a Markdown table."""
+    devices = list(dict.fromkeys(row["device"] for row in rows))
+    latest = {
+        (devices.index(row["device"]), row["shape"], row["splats"], list(ACTIONS).index(row["action"])): row
+        for row in rows
+    }
     columns = {"action": "action", "shape": "shape", "splats": "splats"}
     columns |= {"host_ms": "host ms", "read_mb": "read MB", "written_mb": "written MB"}
     columns |= {"device": "processor", "commit": "commit"}
-    cells = ([cell(row[name]) for name in columns] for row in rows)
+    cells = ([cell(row[name]) for name in columns] for _, row in sorted(latest.items()))
     return common.table(list(columns.values()), cells, set(list(columns.values())[2:-2]))
 
 

@@ -66,7 +66,10 @@ class Shape:
 
     def opacity(self, raw: Array) -> Array:
         """Return the opacity of raw values of `opacity_logit` or `opacity_minus_logit`."""
-        opacity: Array = np.tanh(raw) if self.signed else 0.5 * (1.0 + np.tanh(0.5 * raw))
+        opacity: Array = np.tanh(raw if self.signed else 0.5 * raw)
+        if not self.signed:  # in place: new memory for all splats takes as long as the exponentials
+            opacity += 1.0
+            opacity *= 0.5
         return opacity
 
     def raw_opacity(self, opacity: Array) -> Array:

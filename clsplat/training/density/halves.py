@@ -32,6 +32,7 @@ from ...splats.shapes import Shape
 SPLIT_SHRINK = 1.6  # 3DGS: the drawn halves are smaller by this factor
 PUBLISHED_DISTANCE = 0.5  # 3DSGS
 DISTANCE = 0.8  # of `split_along_axis`
+_CHUNK = 8192  # number of splats that are turned at once: their matrices stay in the cache of a processor
 
 
 def twice(arrays: Mapping[str, Array]) -> dict[str, Array]:
@@ -114,12 +115,19 @@ def _places(parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, chan
 
     shift : (2, N, 3), in the parents' deviations along their axes. changed : the fields that both halves have.
     """
-    old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
-    step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
-    turn = rotations(parents["quat"].astype(np.float64))
-    x, y, z = (step[..., column, None] for column in range(3))
-    # np.einsum adds in this order, too, and takes three times as long.
-    places: Array = parents["mean"] + (turn[..., 0] * x + turn[..., 2] * z + turn[..., 1] * y)
+    old = np.exp(parents["log_scale"].astype(np.float64))
+    if _has_centroid(parents, shape):
+        new = np.exp(changed["log_scale"].astype(np.float64))
+        step = old * (shift + _centroid(parents)) - new * _centroid({**parents, **changed})
+    else:
+        step = old * shift
+    places = np.empty_like(step)
+    for first in range(0, len(old), _CHUNK):
+        rows = slice(first, first + _CHUNK)
+        turn = rotations(parents["quat"][rows].astype(np.float64))
+        x, y, z = (step[:, rows, column, None] for column in range(3))
+        # np.einsum adds in this order, too, and takes three times as long.
+        places[:, rows] = parents["mean"][rows] + (turn[..., 0] * x + turn[..., 2] * z + turn[..., 1] * y)
     return places.reshape(-1, 3)
 
 
@@ -134,11 +142,14 @@ def _delta(arrays: Mapping[str, Array]) -> DoubleArray:
     return delta
 
 
-def _centroid(arrays: Mapping[str, Array], shape: Shape) -> DoubleArray:
-    """Return the vector from the stored position to the centroid, (N, 3), in deviations along the axes of the splat.
+def _has_centroid(arrays: Mapping[str, Array], shape: Shape) -> bool:
+    """Return whether the centroid of a splat may lie beside its stored position.
 
-    It is zero for splats with two opacities, because their halves are placed relative to the plane.
+    Splats with two opacities count as without, because their halves are placed relative to the plane.
     """
-    if shape.skew_form != "direct" or len(opacity_names(arrays)) == 2:
-        return np.zeros((len(arrays["mean"]), 3))
+    return shape.skew_form == "direct" and len(opacity_names(arrays)) == 1
+
+
+def _centroid(arrays: Mapping[str, Array]) -> DoubleArray:
+    """Return the vector from the stored position to the centroid, (N, 3), in deviations along the axes of the splat."""
     return math.sqrt(2.0 / math.pi) * _delta(arrays)
