@@ -43,6 +43,7 @@ from ..training.exposure_file import copy_exposures, exposures_beside
 from ..training.folder import ModelFolder, scene_record
 from ..training.initialise import FROM_POINTS
 from ..training.log import Progress
+from ..training.point_fit import with_fitting_points
 from ..training.stages import StepReports
 from ..training.stored_run import holds_run
 from .job import CONTEXT, INSIDE, RUN, START, BlockJob, train_block, train_block_on_worker
@@ -154,7 +155,7 @@ def _opened(
             state.load()
             config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
             state.check(config, options)
-        scene = with_small_photos_in_memory(scene)
+        scene = with_fitting_points(with_small_photos_in_memory(scene))
         if not resume:
             if names := of_coarse_run(config):
                 warnings.warn(

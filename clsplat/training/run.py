@@ -27,6 +27,7 @@ from .frame_hint import frame_hint
 from .initialise import check_init
 from .log import Progress
 from .model import Model
+from .point_fit import with_fitting_points
 from .trainer import Trainer, Visit
 
 __all__ = ["Model", "Progress", "train"]
@@ -82,6 +83,7 @@ def train(
             checkpoint = fitting_checkpoint(folder, config)
             config = as_decided(config, TrainConfig.from_json(checkpoint.config).to_json())
         else:
+            scene = with_fitting_points(scene)
             config = decide(scene, config).tell(progress)
             if progress is not None:
                 for hint in filter(None, (exposure_hint(scene, config), frame_hint(scene))):

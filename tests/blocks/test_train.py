@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_scene import with_points_elsewhere
 
 from clsplat.blocks import train as module
 from clsplat.blocks.cells import Cells, make_cells
@@ -120,6 +121,13 @@ def test_small_photos_are_decoded_once(scene: Scene, tmp_path: Path) -> None:
 
     train_in_blocks(replace(scene, views=[stored(view) for view in scene.views]), TWO, CONFIG, output=tmp_path)
     assert sorted(decoded) == sorted(view.name for view in scene.train)
+
+
+def test_points_that_do_not_fit_the_photos_are_in_no_block(scene: Scene, tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="the points do not fit the poses") as warned:
+        found = partition_scene(with_points_elsewhere(scene), TWO, CONFIG, output=tmp_path)
+    assert len(warned) == 1
+    assert not any(block.points for block in found.blocks)
 
 
 def test_the_model_has_all_splats_of_all_blocks(finished: BlocksModel, scene: Scene) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from clsplat.files.images import write_png
 from clsplat.scenes.colmap_binary import ModelView, write_binary_model
+from clsplat.scenes.scene import Scene
 
 WIDTH, HEIGHT, N_VIEWS, N_POINTS = 40, 30, 9, 12
 FX, FY, CX, CY = 33.0, 31.0, 18.5, 16.25
@@ -79,3 +80,10 @@ def moved(scale: float = 1.0, shift: float = 0.0) -> list[np.ndarray]:
         pose[:3, 3] = -pose[:3, :3] @ (-scale * pose[:3, :3].T @ pose[:3, 3] + shift)
         poses.append(pose)
     return poses
+
+
+def with_points_elsewhere(scene: Scene) -> Scene:
+    """Return a scene with points that are turned, as by a transform that its poses do not have."""
+    xyz = scene.points.xyz
+    center = np.median(xyz, axis=0)
+    return replace(scene, points=replace(scene.points, xyz=(xyz - center)[:, [1, 2, 0]] * (1, -1, 1) + center))

@@ -1,0 +1,97 @@
+"""Points of another coordinate system than the poses are left out; others are kept, whatever their colours."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_scene import with_points_elsewhere
+
+from clsplat.cameras.seen import seen
+from clsplat.scenes.colmap import NO_POINTS
+from clsplat.scenes.scene import Scene, View
+from clsplat.training.config import TrainConfig
+from clsplat.training.log import Progress
+from clsplat.training.point_fit import point_fit, with_fitting_points
+from clsplat.training.run import train
+
+
+def random_colors(scene: Scene) -> Scene:
+    rgb = np.random.default_rng(0).integers(0, 256, scene.points.rgb.shape, np.uint8)
+    return replace(scene, points=replace(scene.points, rgb=rgb))
+
+
+def test_points_that_fit_are_kept(scene: Scene) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert with_fitting_points(scene) is scene
+
+
+def test_points_elsewhere_are_left_out_with_a_warning(scene: Scene) -> None:
+    wrong = with_points_elsewhere(scene)
+    shown = np.mean([seen(view.camera, wrong.points.xyz).inside.mean() for view in wrong.train])
+    assert shown > 0.1, "some of them lie in the photos by chance"
+    with pytest.warns(UserWarning, match=r"do not show the colours of its \d+ points .* check that both have one"):
+        found = with_fitting_points(wrong)
+    assert len(found.points) == 0
+    assert found.views is wrong.views
+
+
+@pytest.mark.parametrize("change", ["random", "one colour"])
+def test_colours_alone_are_no_reason(scene: Scene, change: str) -> None:
+    """Points have colours of their own in some programs. The photos agree where such points lie."""
+    grey = replace(scene, points=replace(scene.points, rgb=np.full_like(scene.points.rgb, 90)))
+    changed = random_colors(scene) if change == "random" else grey
+    assert with_fitting_points(changed) is changed
+
+
+def test_both_numbers_are_those_of_a_loop(scene: Scene) -> None:
+    """Masked and transparent pixels do not count."""
+    rng, views = np.random.default_rng(1), []
+    for number, view in enumerate(scene.train[:5]):
+        image, half = np.asarray(view.image), np.zeros(view.image.shape[:2], np.bool_)
+        half[:, : image.shape[1] // 2] = True
+        alpha = np.where(half, 255, 100).astype(np.uint8) if number == 1 else None
+        views.append(View(view.name, view.camera, image, half if number == 0 else None, alpha))
+    rows = rng.permutation(len(scene.points))[:1500]
+    points = replace(scene.points, xyz=scene.points.xyz[rows], rgb=scene.points.rgb[rows], track_length=rows)
+    pairs, groups = [], []
+    for place, color in zip(points.xyz, points.rgb, strict=True):
+        contrasts = []
+        for view in views:
+            at = seen(view.camera, place[None])
+            if at.inside[0]:
+                x, y = at.pixel[0].astype(int)
+                if (view.mask is None or view.mask[y, x]) and (view.alpha is None or view.alpha[y, x] == 255):
+                    grey = np.pad(np.asarray(view.image).mean(axis=2), 2, "edge")[y : y + 5, x : x + 5]
+                    pairs.append((color.mean(), grey[2, 2]))
+                    contrasts.append(np.log(grey[2, 2] + 10) - np.log(grey + 10).mean())
+        if len(contrasts) > 1:
+            groups.append(np.array(contrasts))
+    within = sum(((group - group.mean()) ** 2).sum() for group in groups) / sum(len(group) - 1 for group in groups)
+    expected = np.corrcoef(np.array(pairs).T)[0, 1], 1.0 - within / np.concatenate(groups).var()
+    assert point_fit(views, points) == pytest.approx(expected, rel=1e-9)
+
+
+def test_few_points_and_few_photos_say_nothing(scene: Scene) -> None:
+    few = replace(
+        scene.points, xyz=scene.points.xyz[:50], rgb=scene.points.rgb[:50], track_length=scene.points.track_length[:50]
+    )
+    assert point_fit(scene.train, few) is None
+    assert point_fit(scene.train[:1], scene.points) is None
+    assert point_fit(scene.train, NO_POINTS) is None
+    assert point_fit([], scene.points) is None
+
+
+def test_a_run_starts_without_them_and_gives_no_wrong_hint(scene: Scene) -> None:
+    messages: list[str] = []
+
+    def hear(progress: Progress) -> None:
+        messages.append(progress.message)
+
+    with pytest.warns(UserWarning, match="do not fit the poses"):
+        train(with_points_elsewhere(scene), TrainConfig(iterations=2, cap_max=300, sh_degree=0), hear)
+    assert any("the scene has no points" in message for message in messages)
+    assert not any("exposure" in message for message in messages)
