@@ -2,7 +2,8 @@
 
 A photo with a wrong pose teaches splats to stand where the other photos see nothing. Most photos agree with each other,
 so that their renders soon resemble them. A photo counts as an outlier if its render does not resemble it at all, by
-measures that are relative to the other photos: the scene and the stage of the run do not matter.
+measures that are relative to the other photos: the scene and the stage of the run do not matter. In outdoor scenes,
+photos differ much. There an outlier stands out from those that look at the same place: a hard place is hard for all.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..cameras.neighbours import nearest_cameras
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.color import Color
@@ -28,7 +31,9 @@ FEWEST_VIEWS = 10  # of fewer photos, each may be the only one of its place
 MOST = 0.25  # part of the photos that may be outliers; if it is more, nothing says which photos are right
 UNLIKE = 6.0  # times the usual lack of correlation, and at least
 LEAST_UNLIKE = 0.15
-UNUSUAL = 4.5  # times the usual deviation from it, as a factor. In outdoor scenes, photos differ much
+UNUSUAL = 4.5  # times the usual deviation from it, as a factor. In outdoor scenes, photos differ much; there
+UNLIKE_NEAR = 4.0  # times that of the photos from nearby is enough
+NEAR = 4  # photos from nearby; their median counts
 _TINY = 1e-6  # lack of correlation of a perfect render
 _NAMED = 3  # views that the message names
 ERROR = 4.0  # times the usual squared error. A photo of a plain wall may lack correlation, but has a small error
@@ -55,6 +60,8 @@ class OutlierCheck:
         is_on = config.views.outlier_check and len(views) >= FEWEST_VIEWS
         affordable = int(MOST_WORK * config.iterations / (COST * len(views))) if is_on else 0
         self.due = {round(part * config.iterations) for part in CHECKS[:affordable]}
+        cameras = [view.camera for view in views] if self.due else []
+        self.near = nearest_cameras(cameras, NEAR)
 
     def is_due(self, iteration: int) -> bool:
         """Whether a check follows this iteration."""
@@ -63,7 +70,7 @@ class OutlierCheck:
     def look(self, splats: Splats) -> None:
         """Leave the outliers out of the rest of the run."""
         measured = [likeness(self.renderer, splats, view, self.background) for view in self.views]
-        found = outliers(measured)
+        found = outliers(measured, self.near)
         self.is_new, self.sampler.left_out = found != self.sampler.left_out, found
 
     @property
@@ -103,11 +110,18 @@ def likeness(renderer: Renderer, splats: Splats, view: View, background: Color) 
     return Likeness(1.0 - float((photo * shown).sum()) / size if size else 1.0, error)
 
 
-def outliers(measured: Sequence[Likeness]) -> frozenset[int]:
-    """Return the indices of outliers; none if there are too many of them."""
+def outliers(measured: Sequence[Likeness], near: NDArray[np.int64]) -> frozenset[int]:
+    """Return the indices of outliers; none if there are too many of them.
+
+    Parameters
+    ----------
+    measured : of all N photos.
+    near : (N, K) indices of the photos from nearby.
+    """
     unlike, error = np.array(measured).T
     usual = float(np.median(unlike)), float(np.median(error))
     factor = np.log(np.maximum(unlike, _TINY) / max(usual[0], _TINY))
     spread = float(np.median(np.abs(factor)))
-    found = (unlike > max(UNLIKE * usual[0], LEAST_UNLIKE)) & (error > ERROR * usual[1]) & (factor > UNUSUAL * spread)
+    stands_out = (factor > UNUSUAL * spread) | (unlike > UNLIKE_NEAR * np.median(unlike[near], axis=1))
+    found = (unlike > max(UNLIKE * usual[0], LEAST_UNLIKE)) & (error > ERROR * usual[1]) & stands_out
     return frozenset(np.flatnonzero(found).tolist()) if found.mean() <= MOST else frozenset()

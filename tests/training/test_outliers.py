@@ -71,19 +71,32 @@ def test_likeness_agrees_with_numpy(scene: Scene) -> None:
     assert likeness(renderer, splats, nothing, (0.0, 0.0, 0.0)) == Likeness(0.0, 0.0)
 
 
+def beside(n: int) -> np.ndarray:
+    """The four photos around each of n in a row, (n, 4)."""
+    first = np.clip(np.arange(n) - 2, 0, n - 5)
+    return np.array([[other for other in range(start, start + 5) if other != one] for one, start in enumerate(first)])
+
+
+def outliers_of(photos: list[Likeness]) -> frozenset[int]:
+    return outliers(photos, beside(len(photos)))
+
+
 def test_which_views_are_outliers() -> None:
     usual = [Likeness(0.02 + 0.001 * index, 1e-3) for index in range(18)]
-    assert outliers([*usual, Likeness(0.2, 0.01)]) == {18}
-    assert not outliers([*usual, Likeness(0.2, 0.003)]), "a plain wall: its error is small"
+    assert outliers_of([*usual, Likeness(0.2, 0.01)]) == {18}
+    assert not outliers_of([*usual, Likeness(0.2, 0.003)]), "a plain wall: its error is small"
     blurred = [Likeness(0.05 + 0.001 * index, 1e-3) for index in range(18)]
-    assert not outliers([*blurred, Likeness(0.25, 0.01)]), "four times what is usual: a hard photo"
-    assert not outliers([Likeness(0.001 * (1 + index / 18), 1e-5) for index in range(18)] + [Likeness(0.05, 0.01)])
+    assert not outliers_of([*blurred, Likeness(0.25, 0.01)]), "four times what is usual: a hard photo"
+    assert not outliers_of([Likeness(0.001 * (1 + index / 18), 1e-5) for index in range(18)] + [Likeness(0.05, 0.01)])
     wide = [Likeness(0.02 * 1.12 ** (index - 9), 1e-3) for index in range(18)]
-    assert not outliers([*wide, Likeness(0.16, 0.01)]), "eight times what is usual, where photos differ much"
-    assert outliers([*wide, Likeness(1.2, 0.01)]) == {18}
+    assert not outliers_of([*wide, Likeness(0.16, 0.01)]), "eight times what is usual, where photos differ much"
+    assert outliers_of([*wide, Likeness(1.2, 0.01)]) == {18}
+    among_easy = [*wide[:9], Likeness(0.19, 0.01), *wide[9:]]
+    assert outliers_of(among_easy) == {9}, "photos from nearby are easy"
+    assert not outliers_of([*wide[:9], Likeness(0.075, 0.01), *wide[9:]]), "four times those from nearby, but little"
     many = [Likeness(0.5, 0.1)] * 6
-    assert outliers([*usual, *many]) == {18, 19, 20, 21, 22, 23}
-    assert not outliers([*usual, *many, many[0]]), "too many to say which are right"
+    assert outliers_of([*usual, *many]) == {18, 19, 20, 21, 22, 23}
+    assert not outliers_of([*usual, *many, many[0]]), "too many to say which are right"
 
 
 def test_a_run_goes_on_without_photos_of_wrong_poses(misplaced: Scene) -> None:
@@ -112,7 +125,7 @@ def test_photos_that_a_later_check_takes_back_are_reported(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = iter([frozenset({1}), frozenset({1})])
-    monkeypatch.setattr(outliers_module, "outliers", lambda measured: next(found, frozenset()))
+    monkeypatch.setattr(outliers_module, "outliers", lambda measured, near: next(found, frozenset()))
     said: list[str] = []
     config = TrainConfig(iterations=1000, cap_max=200, sh_degree=0)
     model = train(scene, config, lambda progress: said.append(progress.message), output=tmp_path / "m")
