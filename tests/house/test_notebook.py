@@ -97,7 +97,11 @@ def test_resume(scene: Path, tmp_path: Path) -> None:
             os.kill(os.getpid(), signal.SIGINT)
 
     config = small_config(iterations=120)
-    stopped = package.train(package.load_scene(scene), config, interrupt, output=notebook)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a program in the background ignores it
+    try:
+        stopped = package.train(package.load_scene(scene), config, interrupt, output=notebook)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert not stopped.finished
     shutil.copytree(notebook, shell)
     resumed = package.resume(notebook)
