@@ -22,8 +22,11 @@ from .view import View
 
 FEWEST_VIEWS = 6  # fewer photos may agree by chance
 _FEWEST_POINTS = 50  # points in all photos together, in the pixels that do not change
-_LEAST, _MOST = 0.01, 0.3  # of a photo, and of the points in it: less is harmless, more is the background of an object
+_LEAST, _MOST = 0.01, 0.3  # of a photo: less is harmless, more is the background of an object
+# Least points a pixel, in units of the mean of the photo. Points gather in the middle of photos, far from rims.
+DENSITY = 0.03
 _EMPTY = 8  # largest alpha of a pixel without data
+_ALIKE = 0.8  # of the transparent pixels of photos, those that all photos have in common; silhouettes of objects differ
 
 
 class StillPixels(NamedTuple):
@@ -69,11 +72,14 @@ def hide_points(share: float, parts: Iterable[tuple[Camera, Mask]], xyz: DoubleA
         found = seen(camera, some)
         inside += int(np.count_nonzero(found.inside))
         within += int(np.count_nonzero(part[found.rows_and_columns]))
-    return within >= _FEWEST_POINTS and _LEAST <= within / inside <= _MOST
+    return within >= _FEWEST_POINTS and DENSITY * share <= within / inside <= _MOST
 
 
 def still_pixels(views: Sequence[View]) -> tuple[Mask, bool]:
     """Return the pixels that are transparent in all photos, or else of one colour, (H, W), and whether it is the first.
+
+    Transparent pixels count only if they are about the same in all photos. Else they are around the silhouettes of an
+    object.
 
     Parameters
     ----------
@@ -84,12 +90,21 @@ def still_pixels(views: Sequence[View]) -> tuple[Mask, bool]:
     low, high = first.image.copy(), first.image.copy()
     counted: Mask = np.ones(low.shape[:2], np.bool_)
     empty: Mask | None = counted.copy()  # None as soon as a photo is opaque
+    transparent = 0  # pixels of all photos
     for view in views:
         photo = view.loaded()
         if photo.mask is not None:
             counted &= photo.mask
-        empty = None if empty is None or photo.alpha is None else empty & (photo.alpha <= _EMPTY)
+        if empty is not None and photo.alpha is not None:
+            part = photo.alpha <= _EMPTY
+            transparent += int(np.count_nonzero(part))
+            empty = empty & part
+        else:
+            empty = None
         np.minimum(low, photo.image, out=low)
         np.maximum(high, photo.image, out=high)
+    if empty is not None:
+        alike = len(views) * int(np.count_nonzero(empty)) >= _ALIKE * transparent
+        return counted & empty & alike, True
     still: Mask = (high - low).max(axis=2) <= SPREAD
-    return (counted & still, False) if empty is None else (counted & empty, True)
+    return counted & still, False

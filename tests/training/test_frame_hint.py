@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from clsplat.cameras.seen import sampled, seen
 from clsplat.scenes.colmap import Points
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.config import TrainConfig
@@ -69,6 +70,30 @@ def test_what_gets_no_hint(scene: Scene) -> None:
         mask[:4], mask[-4:] = False, False
         masked.append(replace(view, mask=mask))
     assert frame_hint(replace(bars, views=masked)) is None, "they are left out already"
+
+
+def test_few_points_in_a_rim_are_enough(scene: Scene) -> None:
+    """Points gather in the middle of photos: a rim may hold less than a hundredth of them."""
+    cameras = [view.camera for view in scene.train]
+    xyz = np.repeat(near_the_middle(scene, 0.16).xyz, 5, axis=0)  # about as many points as usual scenes have
+    rows = [seen(camera, sampled(xyz)).rows_and_columns[0] for camera in cameras]
+    in_bars = [(row < 4) | (row >= camera.height - 4) for row, camera in zip(rows, cameras, strict=True)]
+    assert 0.0067 < np.concatenate(in_bars).mean() < 0.01, "of the points, for 22 % of the pixels"
+    many = Points(xyz, np.zeros(xyz.shape, np.uint8), np.zeros(len(xyz), np.int64))
+    assert frame_hint(replace(barred(scene), points=many)) is not None
+
+
+def test_transparency_that_differs_is_around_an_object(scene: Scene) -> None:
+    """All photos are transparent at the sides, where points of the scene lie, and around an object as well."""
+    bars = barred(scene, transparent=True)
+    views = []
+    for number, view in enumerate(bars.views):
+        assert view.alpha is not None
+        alpha = view.alpha.copy()
+        alpha[:, 4 * (number % 6) : 4 * (number % 6) + 8] = 0
+        views.append(replace(view, alpha=alpha))
+    assert frame_hint(bars) is not None
+    assert frame_hint(replace(bars, views=views)) is None
 
 
 def test_a_run_says_it_once(scene: Scene) -> None:
