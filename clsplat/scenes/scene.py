@@ -152,7 +152,8 @@ def load_scene(
         exists, the masks named in transforms.json, and masks beside photos. "none" keeps bars, too.
     alpha : use of a photo's transparency. "background" composites the photo over the background; "mask" masks out
         pixels that are less than half opaque. By default it is "background", but "mask" if the same pixels are
-        transparent in all photos and points lie there: rims that undistortion leaves without data.
+        transparent in all photos and points lie there: rims that undistortion leaves without data. So it is if some
+        photos have transparent parts and others are opaque: something was cut out there.
     read_photos : whether to decode the training photos now and keep them. Photos of test views, or all of them, are
         decoded at each use instead (`View.loaded`).
     only : names of the photos to read, for a part of a large scene. The files of the others are not opened, except for

@@ -1,13 +1,19 @@
-"""Parts of photos that hold no data: transparent rims, and bars. Points of the scene that lie there show it."""
+"""Parts of photos that hold no data: transparent rims, parts that were cut out, and bars.
+
+Points of the scene that lie there show it.
+"""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
-from ..cameras.seen import sampled_views
+import numpy as np
+
+from ..cameras.seen import sampled, sampled_views, seen
 from ..errors import InputError
 from ..files.images import has_alpha
 from ..files.masks import Mask, read_mask
@@ -16,9 +22,13 @@ from .bars import NO_BARS, Bars, commonest_size, find_bars
 from .options import ALPHA_USES
 from .posed_images import PosedImages
 from .read_view import PhotoReader
-from .still_pixels import FEWEST_VIEWS, hide_points, pixels_before_scene
+from .still_pixels import DENSITY, FEWEST_VIEWS, hide_points, pixels_before_scene
 from .undistort import RegisteredImage
 from .view import StoredView
+
+# Share of photos with transparent parts from which the others do not show that these are no background: an object may
+# fill the others. Without points nothing else separates the two.
+_MOST_CUT, _MOST_CUT_WITHOUT_POINTS = 0.9, 0.5
 
 
 def use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: Color) -> str:
@@ -30,26 +40,68 @@ def use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: Co
     ----------
     root : the scene, for the warning. resolution, background : as for `load_scene`.
     """
-    some = sampled_views(posed.photos)
-    readers = [
-        PhotoReader(photo, posed.files[photo.name], posed.sizes[photo.name], resolution, background, None, False)
-        for photo in some
-    ]
     found = None
     # A photo that cannot be used is reported when all are read.
     with suppress(InputError):
-        if len(posed.points) and all(has_alpha(reader.file) for reader in readers):
-            views = [StoredView(reader.photo.name, reader.camera(), reader.view) for reader in readers]
-            found = pixels_before_scene(views, posed.points.xyz)
+        photos = [photo for photo in posed.photos if has_alpha(posed.files[photo.name])]
+        readers = [
+            PhotoReader(photo, posed.files[photo.name], posed.sizes[photo.name], resolution, background, None, True)
+            for photo in sampled_views(photos)
+        ]
+        if len(photos) == len(posed.photos) and len(posed.points):
+            found = _rims(readers, posed)
+        if found is None and photos:
+            found = _cut_outs(readers, posed, len(photos))
     if found is None:
         return ALPHA_USES[0]
     warnings.warn(
-        f"{root}: {found.share:.0%} of the pixels are transparent in all photos, but points of the scene lie there: "
-        'they are left out as pixels without data (alpha "mask"); with alpha "background" they are the background of '
-        "an object",
+        f'{root}: {found}: they are left out as pixels without data (alpha "mask"); with alpha "background" they are '
+        "the background of an object",
         stacklevel=4,
     )
     return ALPHA_USES[1]
+
+
+def _rims(readers: Sequence[PhotoReader], posed: PosedImages) -> str | None:
+    """Return words for pixels that are transparent in all photos where points of the scene lie; None without such."""
+    views = [
+        StoredView(reader.photo.name, reader.camera(), replace(reader, alpha_hides=False).view) for reader in readers
+    ]
+    found = pixels_before_scene(views, posed.points.xyz)
+    if found is None:
+        return None
+    return f"{found.share:.0%} of the pixels are transparent in all photos, but points of the scene lie there"
+
+
+def _cut_outs(readers: Sequence[PhotoReader], posed: PosedImages, with_alpha: int) -> str | None:
+    """Return words for transparent parts of some photos, if other photos are opaque; None without such.
+
+    Opaque photos show what is around, so transparent parts are no background of an object. But an object may fill a few
+    of its photos, and a sky may be cut out of those that show it: no points of the scene lie there.
+
+    Parameters
+    ----------
+    readers : of the photos that may be transparent, or of some of them. with_alpha : number of these photos.
+    """
+    n, xyz = len(posed.photos), posed.points.xyz
+    per_reader = with_alpha / len(readers)
+    limit = n * (_MOST_CUT if len(xyz) else _MOST_CUT_WITHOUT_POINTS)
+    shares: list[float] = []
+    within, expected = 0, 0.0
+    for reader in readers:
+        view = reader.read()
+        if isinstance(view, str) or view.mask is None:
+            continue
+        found = seen(view.camera, sampled(xyz))
+        shares.append(1.0 - float(view.mask.mean()))
+        within += int(np.count_nonzero(~view.mask[found.rows_and_columns]))
+        expected += shares[-1] * int(np.count_nonzero(found.inside))
+        if len(shares) * per_reader >= limit:
+            return None
+    if not shares or within < DENSITY * expected:
+        return None
+    number = f"{'about ' if per_reader > 1 else ''}{round(len(shares) * per_reader)} of {n}"
+    return f"{number} photos have transparent parts ({np.mean(shares):.0%} of their pixels), and the others are opaque"
 
 
 def bars_of(root: Path, posed: PosedImages, mask_of: Mapping[str, Path]) -> Bars:

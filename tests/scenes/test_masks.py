@@ -181,7 +181,7 @@ def test_transparency_as_background_or_mask(folder: Path) -> None:
     rgb = photo_of(0)
     alpha = np.where(left_half(), 255, 51).astype(np.uint8)
     write_png(file, np.dstack([rgb, alpha]))
-    over = load_scene(folder, background=(1.0, 0.0, 0.0)).views[0]
+    over = load_scene(folder, background=(1.0, 0.0, 0.0), alpha="background").views[0]
     assert over.mask is None
     np.testing.assert_array_equal(over.alpha, alpha)
     laid_over = 0.2 * rgb + 0.8 * np.array([255, 0, 0])

@@ -211,7 +211,8 @@ def test_transparent_photos_get_the_background(folder: Path) -> None:
     image = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     image[..., 0], image[: HEIGHT // 2, :, 3], image[HEIGHT // 2 :, :, 3] = 200, 255, 51
     write_png(folder / "images" / NAMES[0], image)
-    black, white = load_scene(folder).images[0], load_scene(folder, background=(1, 1, 1)).images[0]
+    black = load_scene(folder, alpha="background").images[0]
+    white = load_scene(folder, background=(1, 1, 1), alpha="background").images[0]
     np.testing.assert_array_equal(black[0, 0], [200, 0, 0])
     np.testing.assert_array_equal(black[-1, 0], [40, 0, 0])
     np.testing.assert_array_equal(white[0, 0], [200, 0, 0])
