@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import numpy as np
 from ..cameras.seen import sampled, sampled_views, seen
 from ..scenes.colmap import Points
 from ..splats.color import SPREAD
+from ..splats.fields import DoubleArray
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
@@ -17,6 +19,12 @@ if TYPE_CHECKING:
     from .config import TrainConfig
 
 LARGE_SPREAD = 0.6  # stops; captures with one exposure have 0.1 to 0.5
+_SMALL_SPREAD = 0.35  # stops; a smaller spread costs little
+_UNEXPLAINED = (
+    0.82  # of the differences between photos: captures with one exposure keep more than 0.87 at such a spread
+)
+_FEWEST_TO_FIT = 12  # photos: with fewer, most points are in so few that exposures explain anything
+_ROUNDS = 5  # of the fit; further ones change it by less than a hundredth
 _GAMMA = 2.2  # of photos: stops are factors of light, not of pixels
 _DARK, _BRIGHT = 8, 247  # pixels outside have lost their brightness
 _FEWEST_POINTS, _FEWEST_PHOTOS = 20, 4  # points in a photo, and photos with as many
@@ -27,7 +35,9 @@ def exposure_hint(scene: Scene, config: TrainConfig) -> str | None:
     if config.appearance.exposure:
         return None
     spread = exposure_spread(scene.train, scene.points)
-    if spread is None or spread < LARGE_SPREAD:
+    if spread is None or spread < _SMALL_SPREAD:
+        return None
+    if spread < LARGE_SPREAD and unexplained_share(scene.train, scene.points) > _UNEXPLAINED:
         return None
     return f"the photos differ in exposure (by {spread:.1f} stops from their mean): the option exposure learns them"
 
@@ -50,3 +60,37 @@ def exposure_spread(views: Sequence[View], points: Points) -> float | None:
         if np.count_nonzero(sound) >= _FEWEST_POINTS:
             stops.append(_GAMMA * np.median(np.log2(shown[sound] / known[sound]), axis=0))
     return float(np.std(stops, axis=0).max()) if len(stops) >= _FEWEST_PHOTOS else None
+
+
+def unexplained_share(views: Sequence[View], points: Points) -> float:
+    """Return the part of the differences between photos of one point that exposures do not explain; 1 for few photos.
+
+    Photos differ also by reflections, and by what hides a point. A logarithm of a pixel is fitted as that of its point
+    plus the exposure of its photo, by medians in turn (Tukey's median polish). The result is the median difference from
+    the fit, by that from the medians of the points alone. Channels are added.
+    """
+    if len(views) < _FEWEST_TO_FIT:
+        return 1.0
+    xyz, some = sampled(points.xyz), sampled_views(views)
+    stops: DoubleArray = np.full((len(some), len(xyz), 3), np.nan)
+    for number, view in enumerate(some):
+        found = seen(view.camera, xyz)
+        shown = np.asarray(view.loaded().image)[found.rows_and_columns].astype(np.float64)
+        sound = ((shown > _DARK) & (shown < _BRIGHT)).all(axis=1)
+        stops[number, np.flatnonzero(found.inside)[sound]] = np.log2(shown[sound])
+    stops = stops[:, np.count_nonzero(~np.isnan(stops[:, :, 0]), axis=0) > 1]
+    stops = stops[np.count_nonzero(~np.isnan(stops[:, :, 0]), axis=1) >= _FEWEST_POINTS]
+    if not stops.size:
+        return 1.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a point may be left without photos
+        before = _median_difference(stops)
+        for _ in range(_ROUNDS):
+            stops = stops - np.nanmedian(stops - np.nanmedian(stops, axis=0), axis=1, keepdims=True)
+        after = _median_difference(stops)
+    return after / before if before else 1.0
+
+
+def _median_difference(stops: DoubleArray) -> float:
+    """Return the median difference of values (V, P, 3) from the median of their point, added over the channels."""
+    return float(np.nanmedian(np.abs(stops - np.nanmedian(stops, axis=0)), axis=(0, 1)).sum())

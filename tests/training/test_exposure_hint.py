@@ -8,14 +8,21 @@ import numpy as np
 import pytest
 
 from clsplat.scenes.colmap import Points
-from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.demo.scene import write_capture
+from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.config import TrainConfig
-from clsplat.training.exposure_hint import exposure_hint, exposure_spread
+from clsplat.training.exposure_hint import LARGE_SPREAD, exposure_hint, exposure_spread, unexplained_share
 from clsplat.training.log import Progress
 from clsplat.training.run import train
 from clsplat.training.stages import StepReports
 
 CONFIG = TrainConfig(iterations=3, cap_max=50, sh_degree=0)
+
+
+@pytest.fixture(scope="module")
+def long_scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """The small capture with 21 training photos."""
+    return load_scene(write_capture(tmp_path_factory.mktemp("long") / "yard", 48, 36, 24))
 
 
 def exposed(scene: Scene, stops: float) -> Scene:
@@ -65,6 +72,41 @@ def test_a_run_says_it_once_and_not_with_the_option(scene: Scene) -> None:
     assert len(said) == 1
     assert said[0].endswith("stops from their mean): the option exposure learns them")
     assert exposure_hint(uneven, CONFIG.replace(exposure=True)) is None
+
+
+def test_two_exposures_of_one_stop_get_a_hint(long_scene: Scene) -> None:
+    """Their spread alone is not more than that of photos of one exposure, but exposures explain it."""
+    uneven = exposed(long_scene, 0.5)
+    spread = exposure_spread(uneven.train, uneven.points)
+    assert spread is not None
+    assert 0.35 < spread < LARGE_SPREAD
+    assert unexplained_share(uneven.train, uneven.points) < 0.8
+    assert exposure_hint(uneven, CONFIG) is not None
+    assert exposure_hint(exposed(long_scene, 0.2), CONFIG) is None
+
+
+def test_a_spread_that_exposures_do_not_explain_gets_no_hint(
+    long_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reflections, and what hides points, differ between photos, too."""
+    monkeypatch.setattr("clsplat.training.exposure_hint.exposure_spread", lambda *_: 0.5)
+    assert exposure_hint(long_scene, CONFIG) is None
+    monkeypatch.setattr("clsplat.training.exposure_hint.exposure_spread", lambda *_: 0.7)
+    assert exposure_hint(long_scene, CONFIG) is not None
+
+
+def test_few_photos_do_not_say_what_exposures_explain(long_scene: Scene) -> None:
+    """With few photos, most points are in so few that exposures explain anything."""
+    uneven = exposed(long_scene, 0.5)
+    assert unexplained_share(uneven.train[:11], long_scene.points) == 1.0
+    assert unexplained_share(uneven.train[:12], long_scene.points) < 1.0
+    assert exposure_hint(replace(uneven, views=uneven.train[:11], test_names=frozenset()), CONFIG) is None
+
+
+def test_points_that_the_photos_hardly_show_explain_nothing(long_scene: Scene) -> None:
+    points = long_scene.points
+    few = Points(points.xyz[:5], points.rgb[:5], points.track_length[:5])
+    assert unexplained_share(exposed(long_scene, 1.5).train, few) == 1.0
 
 
 def test_few_points_say_nothing(scene: Scene) -> None:
