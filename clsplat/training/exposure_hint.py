@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
 LARGE_SPREAD = 0.6  # stops; captures with one exposure have 0.1 to 0.5
 _SMALL_SPREAD = 0.35  # stops; a smaller spread costs little
-_UNEXPLAINED = (
-    0.82  # of the differences between photos: captures with one exposure keep more than 0.87 at such a spread
-)
+_UNEXPLAINED = 0.82  # of the differences between photos; reflections and what hides points leave more
 _FEWEST_TO_FIT = 12  # photos: with fewer, most points are in so few that exposures explain anything
 _ROUNDS = 5  # of the fit; further ones change it by less than a hundredth
 _GAMMA = 2.2  # of photos: stops are factors of light, not of pixels
