@@ -553,7 +553,7 @@ def test_photos_that_the_coarse_run_leaves_out_are_in_no_later_stage(
     gone = scene.train[2].name
     monkeypatch.setattr("clsplat.training.outliers.FEWEST_VIEWS", 1)
     monkeypatch.setattr("clsplat.training.outliers.MOST_WORK", 1.0)
-    monkeypatch.setattr("clsplat.training.outliers.outliers", lambda measured: frozenset({2}))
+    monkeypatch.setattr("clsplat.training.outliers.outliers", lambda measured, near: frozenset({2}))
     found = train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
     assert found.report["coarse"]["left_out"] == [gone]
     blocks = found.report["partition"]["blocks"]
