@@ -1,7 +1,7 @@
 """Image files: reading, writing and resizing. This is the only module that uses Pillow.
 
 Images are read as stored: the EXIF orientation is not applied. COLMAP and 3DGS do not apply it either, and camera poses
-refer to the stored pixels. Only photos without poses are read upright.
+refer to the stored pixels. Photos without poses are read upright, and those whose cameras fit in no other way.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -60,11 +60,15 @@ def commonest_size(sizes: Mapping[str, tuple[int, int]]) -> tuple[int, int] | No
     return Counter(sizes.values()).most_common(1)[0][0] if sizes else None
 
 
-def find_bars(files: Sequence[Path]) -> Bars:
+def find_bars(files: Sequence[Path], upright: Collection[Path] = ()) -> Bars:
     """Return the bars that photos of one size have in common.
 
     Bars end in the same row or column of most photos. What is alike in all photos, but ends elsewhere in each, is the
     scene, such as a bright sky. Reading ends as soon as no bar is left, so photos of most scenes are not read.
+
+    Parameters
+    ----------
+    upright : those of the files that are turned by their EXIF orientation.
 
     Raises
     ------
@@ -74,7 +78,7 @@ def find_bars(files: Sequence[Path]) -> Bars:
     lengths = np.ones(4)
     colors: list[NDArray[np.float64]] = []
     for file in files:
-        image = read_image(file)
+        image = read_image(file, file in upright)
         if image.shape[2] == 4 and image[..., 3].min() < 255:
             return NO_BARS
         across = image[..., :3].transpose(1, 0, 2)

@@ -34,7 +34,7 @@ class PosedImages:
     ----------
     photos : registered images with a readable header, sorted by name.
     files : file of each photo, by name, with those left out.
-    sizes : (width, height) of each photo as stored [px], by name.
+    sizes : (width, height) of each photo as read [px], by name.
     points : point cloud, may be empty.
     test_names : names of the photos that the scene's files hold out for evaluation, with those left out; None if the
         files do not specify any.
@@ -42,6 +42,7 @@ class PosedImages:
     left_out : reason why a photo with a pose cannot be used, by name.
     origin : the point of the file's coordinates that is the origin of the poses and points (origin.py).
     unused : names of those left out that the file itself does not use, such as disabled cameras.
+    upright : names of the photos that are turned by their EXIF orientation (turned_photos.py); others are as stored.
     """
 
     photos: list[RegisteredImage]
@@ -53,6 +54,7 @@ class PosedImages:
     left_out: dict[str, str] = field(default_factory=dict)
     origin: tuple[float, float, float] = ORIGIN
     unused: frozenset[str] = frozenset()
+    upright: frozenset[str] = frozenset()
 
     @property
     def names(self) -> list[str]:

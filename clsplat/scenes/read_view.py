@@ -39,10 +39,11 @@ class PhotoReader:
     Parameters
     ----------
     photo : the photo's name, pose and lens.
-    file : its file. size : its (width, height) as stored [px].
+    file : its file. size : its (width, height) as read, before `resolution` [px].
     mask_file : file of its mask, if it has one.
     alpha_hides : whether transparency is a mask.
     bars : bars of the photo, which are masked out.
+    upright : whether the photo is turned by its EXIF orientation.
     """
 
     photo: RegisteredImage
@@ -53,6 +54,7 @@ class PhotoReader:
     mask_file: Path | None
     alpha_hides: bool
     bars: Bars = NO_BARS
+    upright: bool = False
 
     @property
     def decoding_bytes(self) -> int:
@@ -80,7 +82,9 @@ class PhotoReader:
         camera = self.camera()
         size = camera.width, camera.height
         try:
-            stored = read_image(self.file, opaque_size=size if is_pinhole(self.photo.lens) else None)
+            stored = read_image(
+                self.file, upright=self.upright, opaque_size=size if is_pinhole(self.photo.lens) else None
+            )
         except InputError as error:
             return str(error)
         width, height = self.size

@@ -38,6 +38,7 @@ from .pose_checks import (
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
 from .scene_files import SCENE_ENDINGS, described_by
+from .turned_photos import with_upright_photos
 from .view import View
 from .without_data import bars_of, use_of_alpha
 from .wrong_folder import describe_file, of_other_program, scene_hint
@@ -204,6 +205,7 @@ def load_scene(
             mask_of.get(photo.name),
             alpha == "mask",
             bars if posed.sizes[photo.name] == barred_size else NO_BARS,
+            photo.name in posed.upright,
         )
         for photo in photos
     ]
@@ -340,7 +342,7 @@ def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | 
         posed = read_colmap(root, images)
     check_left_out(root, posed, posed.left_out)
     size = size_of(posed)
-    posed = near_origin(root, posed, size, origin)
+    posed = with_upright_photos(near_origin(root, posed, size, origin))
     check_poses(root, posed, size)
     return replace(posed, points=without_far_points(root, posed.points))
 

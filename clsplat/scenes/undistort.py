@@ -165,7 +165,7 @@ def _scaled(lens: Any, width: int, height: int, name: str) -> Any:
     if not _images.same_aspect((width, height), (lens.width, lens.height)):
         raise InputError(
             f"image {name!r} is {width}x{height} px but its camera {lens.width}x{lens.height}; "
-            "use the photos that the model was made from, whole and unrotated"
+            "use the photos that the model was made from, whole, and turned as its poses are"
         )
     scaled = copy.copy(lens)
     if (width, height) != (lens.width, lens.height):

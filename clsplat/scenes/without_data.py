@@ -45,7 +45,16 @@ def use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: Co
     with suppress(InputError):
         photos = [photo for photo in posed.photos if has_alpha(posed.files[photo.name])]
         readers = [
-            PhotoReader(photo, posed.files[photo.name], posed.sizes[photo.name], resolution, background, None, True)
+            PhotoReader(
+                photo,
+                posed.files[photo.name],
+                posed.sizes[photo.name],
+                resolution,
+                background,
+                None,
+                True,
+                upright=photo.name in posed.upright,
+            )
             for photo in sampled_views(photos)
         ]
         if len(photos) == len(posed.photos) and len(posed.points):
@@ -121,7 +130,8 @@ def bars_of(root: Path, posed: PosedImages, mask_of: Mapping[str, Path]) -> Bars
     some = sampled_views(photos)
     # A photo that cannot be used is reported when all are read.
     with suppress(InputError):
-        bars = find_bars([posed.files[photo.name] for photo in some])
+        files = {photo.name: posed.files[photo.name] for photo in some}
+        bars = find_bars(list(files.values()), {files[name] for name in files.keys() & posed.upright})
         if bars == NO_BARS:
             return bars
         covered = ~bars.uncovered(*size)
