@@ -11,11 +11,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..cameras.seen import sampled, sampled_views, seen
+from ..cameras.seen import Seen, sampled_views, seen
 from ..scenes.colmap import NO_POINTS, Points
 from ..splats.color import SPREAD
 from ..splats.fields import DoubleArray
@@ -25,9 +26,13 @@ if TYPE_CHECKING:
     from ..scenes.scene import Scene
     from ..scenes.view import View
 
+Number = TypeVar("Number", bound=np.generic)
+
 # Between those of right and of wrong points (docs/decisions.md, "Points that do not fit the photos are left out").
-_LEAST_CORRELATION, _LEAST_AGREEMENT = 0.1, 0.1
+_LEAST_CORRELATION, _LEAST_AGREEMENT = 0.05, 0.1
 _FEWEST_POINTS = 100  # in two photos or more
+_CELLS = 16  # along each side of a photo; only the nearest point of a cell counts, because walls hide the others
+_SAMPLED = 20_000  # points that are looked at: enough if most of them are in other rooms
 _AROUND = 5  # side of the square of pixels that a pixel is compared with
 _FLOOR = 10.0  # added to brightness 0..255 before its logarithm, so that noise in the dark counts little
 
@@ -53,7 +58,7 @@ def with_fitting_points(scene: Scene) -> Scene:
 def point_fit(views: Sequence[View], points: Points) -> tuple[float, float] | None:
     """Return how well photos show points; None if too few points are in several photos, or if points have no colours.
 
-    Masked and transparent pixels do not count.
+    In each part of a photo, only the nearest point counts. Masked and transparent pixels do not count.
 
     Returns
     -------
@@ -62,7 +67,7 @@ def point_fit(views: Sequence[View], points: Points) -> tuple[float, float] | No
     """
     if not len(points) or np.ptp(points.rgb.astype(int), axis=0).max() <= SPREAD:
         return None
-    found = np.array([_at_points(view.loaded(), sampled(points.xyz)) for view in sampled_views(views)])
+    found = np.array([_at_points(view.loaded(), _some(points.xyz)) for view in sampled_views(views)])
     if not len(found):
         return None
     pixels, contrasts = found[:, 0], found[:, 1]
@@ -71,7 +76,7 @@ def point_fit(views: Sequence[View], points: Points) -> tuple[float, float] | No
     several = count > 1
     if np.count_nonzero(several) < _FEWEST_POINTS:
         return None
-    brightness = np.broadcast_to(sampled(points.rgb).mean(axis=1), pixels.shape)
+    brightness = np.broadcast_to(_some(points.rgb).mean(axis=1), pixels.shape)
     contrasts, count = contrasts[:, several], count[several]
     within = np.nansum((contrasts - np.nansum(contrasts, axis=0) / count) ** 2) / np.sum(count - 1)
     overall = np.nanvar(contrasts)
@@ -86,7 +91,7 @@ def _at_points(view: View, xyz: DoubleArray) -> DoubleArray:
     The local contrast is the logarithm of the brightness, less its mean over the pixels around.
     """
     found = seen(view.camera, xyz)
-    row, column = found.rows_and_columns
+    index, row, column = _nearest(found, view.camera.width, view.camera.height)
     image, near = np.asarray(view.image), np.arange(_AROUND) - _AROUND // 2
     rows = np.clip(row[:, None] + near, 0, image.shape[0] - 1)
     columns = np.clip(column[:, None] + near, 0, image.shape[1] - 1)
@@ -98,5 +103,20 @@ def _at_points(view: View, xyz: DoubleArray) -> DoubleArray:
     if view.alpha is not None:
         shown[:, view.alpha[row, column] < OPAQUE] = np.nan
     values = np.full((2, len(xyz)), np.nan)
-    values[:, found.inside] = shown
+    values[:, index] = shown
     return values
+
+
+def _nearest(found: Seen, width: int, height: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return index, row and column of the nearest point in each cell of a photo with this size [px]."""
+    row, column = found.rows_and_columns
+    index = np.flatnonzero(found.inside)
+    cell = row * _CELLS // height * _CELLS + column * _CELLS // width
+    order = np.lexsort((found.depth[index], cell))
+    first = order[np.diff(cell[order], prepend=-1) > 0]
+    return index[first], row[first], column[first]
+
+
+def _some(values: NDArray[Number]) -> NDArray[Number]:
+    """Return at most `_SAMPLED` of the values of points, (P, ...), evenly spread in their order."""
+    return values[:: -(-len(values) // _SAMPLED) or 1]

@@ -79,11 +79,11 @@ def train(
     folder = None if output is None else ModelFolder(output)
     with nullcontext() if folder is None else folder.for_run(resume=resume, overwrite=overwrite):
         checkpoint = None
+        scene = with_fitting_points(scene)  # also to go on: the extent of the scene depends on the points
         if folder is not None and resume:
             checkpoint = fitting_checkpoint(folder, config)
             config = as_decided(config, TrainConfig.from_json(checkpoint.config).to_json())
         else:
-            scene = with_fitting_points(scene)
             config = decide(scene, config).tell(progress)
             if progress is not None:
                 for hint in filter(None, (exposure_hint(scene, config), frame_hint(scene))):

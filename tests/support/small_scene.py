@@ -86,4 +86,4 @@ def with_points_elsewhere(scene: Scene) -> Scene:
     """Return a scene with points that are turned, as by a transform that its poses do not have."""
     xyz = scene.points.xyz
     center = np.median(xyz, axis=0)
-    return replace(scene, points=replace(scene.points, xyz=(xyz - center)[:, [1, 2, 0]] * (1, -1, 1) + center))
+    return replace(scene, points=replace(scene.points, xyz=(xyz - center)[:, [2, 0, 1]] * (1, -1, 1) + center))
