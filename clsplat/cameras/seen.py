@@ -47,9 +47,9 @@ def seen(camera: Camera, xyz: NDArray[np.float64]) -> Seen:
     return Seen(depth, pixel, inside)
 
 
-def sampled(xyz: NDArray[Number]) -> NDArray[Number]:
-    """Return at most 2000 of the points (P, ...), evenly spread in their order: enough for what holds for all."""
-    return xyz[:: -(-len(xyz) // _SAMPLED_POINTS) or 1]
+def sampled(xyz: NDArray[Number], at_most: int = _SAMPLED_POINTS) -> NDArray[Number]:
+    """Return at most 2000 (or `at_most`) of the points (P, ...), evenly spread: enough for what holds for all."""
+    return xyz[:: -(-len(xyz) // at_most) or 1]
 
 
 def sampled_views(views: Sequence[T]) -> Sequence[T]:

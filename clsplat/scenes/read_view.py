@@ -20,6 +20,7 @@ from ..files.masks import read_mask, resize_mask
 from ..splats.color import Color
 from .bars import NO_BARS, Bars
 from .photo_size import target_size
+from .posed_images import PosedImages
 from .undistort import RegisteredImage, is_pinhole
 from .view import StoredView, View
 
@@ -55,6 +56,22 @@ class PhotoReader:
     alpha_hides: bool
     bars: Bars = NO_BARS
     upright: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        posed: PosedImages,
+        photo: RegisteredImage,
+        resolution: int,
+        background: Color,
+        mask_file: Path | None = None,
+        alpha_hides: bool = False,
+        bars: Bars = NO_BARS,
+    ) -> PhotoReader:
+        """Return the reader of one of the photos of a scene."""
+        name = photo.name
+        file, size, upright = posed.files[name], posed.sizes[name], name in posed.upright
+        return cls(photo, file, size, resolution, background, mask_file, alpha_hides, bars, upright)
 
     @property
     def decoding_bytes(self) -> int:

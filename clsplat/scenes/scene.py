@@ -196,16 +196,14 @@ def load_scene(
     bars = bars_of(root, posed, mask_of) if bars is None else checked_bars(bars)
     barred_size = commonest_size(posed.sizes)
     readers = [
-        PhotoReader(
+        PhotoReader.of(
+            posed,
             photo,
-            posed.files[photo.name],
-            posed.sizes[photo.name],
             resolution,
             background,
             mask_of.get(photo.name),
             alpha == "mask",
             bars if posed.sizes[photo.name] == barred_size else NO_BARS,
-            photo.name in posed.upright,
         )
         for photo in photos
     ]

@@ -45,17 +45,7 @@ def use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: Co
     with suppress(InputError):
         photos = [photo for photo in posed.photos if has_alpha(posed.files[photo.name])]
         readers = [
-            PhotoReader(
-                photo,
-                posed.files[photo.name],
-                posed.sizes[photo.name],
-                resolution,
-                background,
-                None,
-                True,
-                upright=photo.name in posed.upright,
-            )
-            for photo in sampled_views(photos)
+            PhotoReader.of(posed, photo, resolution, background, alpha_hides=True) for photo in sampled_views(photos)
         ]
         if len(photos) == len(posed.photos) and len(posed.points):
             found = _rims(readers, posed)

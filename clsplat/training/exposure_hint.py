@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.seen import sampled, sampled_views, seen
 from ..scenes.colmap import Points
@@ -51,9 +52,8 @@ def exposure_spread(views: Sequence[View], points: Points) -> float | None:
     xyz, colors = sampled(points.xyz), sampled(points.rgb.astype(np.float64))
     stops = []
     for view in sampled_views(views):
-        found = seen(view.camera, xyz)
-        shown = np.asarray(view.loaded().image)[found.rows_and_columns].astype(np.float64)
-        known = colors[found.inside]
+        inside, shown = _pixels(view, xyz)
+        known = colors[inside]
         sound = ((np.minimum(shown, known) > _DARK) & (np.maximum(shown, known) < _BRIGHT)).all(axis=1)
         if np.count_nonzero(sound) >= _FEWEST_POINTS:
             stops.append(_GAMMA * np.median(np.log2(shown[sound] / known[sound]), axis=0))
@@ -72,10 +72,9 @@ def unexplained_share(views: Sequence[View], points: Points) -> float:
     xyz, some = sampled(points.xyz), sampled_views(views)
     stops: DoubleArray = np.full((len(some), len(xyz), 3), np.nan)
     for number, view in enumerate(some):
-        found = seen(view.camera, xyz)
-        shown = np.asarray(view.loaded().image)[found.rows_and_columns].astype(np.float64)
+        inside, shown = _pixels(view, xyz)
         sound = ((shown > _DARK) & (shown < _BRIGHT)).all(axis=1)
-        stops[number, np.flatnonzero(found.inside)[sound]] = np.log2(shown[sound])
+        stops[number, np.flatnonzero(inside)[sound]] = np.log2(shown[sound])
     stops = stops[:, np.count_nonzero(~np.isnan(stops[:, :, 0]), axis=0) > 1]
     stops = stops[np.count_nonzero(~np.isnan(stops[:, :, 0]), axis=1) >= _FEWEST_POINTS]
     if not stops.size:
@@ -87,6 +86,12 @@ def unexplained_share(views: Sequence[View], points: Points) -> float:
             stops = stops - np.nanmedian(stops - np.nanmedian(stops, axis=0), axis=1, keepdims=True)
         after = _median_difference(stops)
     return after / before if before else 1.0
+
+
+def _pixels(view: View, xyz: DoubleArray) -> tuple[NDArray[np.bool_], DoubleArray]:
+    """Return whether points (P, 3) are in a photo, (P,), and the pixels where those are, (N, 3)."""
+    found = seen(view.camera, xyz)
+    return found.inside, np.asarray(view.loaded().image)[found.rows_and_columns].astype(np.float64)
 
 
 def _median_difference(stops: DoubleArray) -> float:

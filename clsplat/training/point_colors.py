@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..cameras.seen import sampled_views, seen
-from .silhouettes import OPAQUE
+from .silhouettes import opaque_at
 
 if TYPE_CHECKING:
     from ..scenes.colmap import Points
@@ -35,10 +35,7 @@ def with_colors(points: Points, views: Sequence[View]) -> Points:
             found = seen(photo.camera, points.xyz[part])
             at = found.rows_and_columns
             color = np.asarray(photo.image)[at].astype(np.float32)
-            if photo.mask is not None:
-                color[~photo.mask[at]] = np.nan
-            if photo.alpha is not None:
-                color[photo.alpha[at] < OPAQUE] = np.nan
+            color[~opaque_at(photo, at)] = np.nan
             pixels[number, found.inside] = color
         shown = ~np.isnan(pixels[:, :, 0]).all(axis=0)
         rgb[part][shown] = np.rint(np.nanmedian(pixels[:, shown], axis=0))

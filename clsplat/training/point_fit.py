@@ -11,22 +11,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.seen import Seen, sampled_views, seen
+from ..cameras.seen import Seen, sampled, sampled_views, seen
 from ..scenes.colmap import NO_POINTS, Points
 from ..splats.color import SPREAD
 from ..splats.fields import DoubleArray
-from .silhouettes import OPAQUE
+from .silhouettes import opaque_at
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
     from ..scenes.view import View
-
-Number = TypeVar("Number", bound=np.generic)
 
 # Between those of right and of wrong points (docs/decisions.md, "Points that do not fit the photos are left out").
 _LEAST_CORRELATION, _LEAST_AGREEMENT = 0.05, 0.1
@@ -67,7 +65,8 @@ def point_fit(views: Sequence[View], points: Points) -> tuple[float, float] | No
     """
     if not len(points) or np.ptp(points.rgb.astype(int), axis=0).max() <= SPREAD:
         return None
-    found = np.array([_at_points(view.loaded(), _some(points.xyz)) for view in sampled_views(views)])
+    xyz, colors = sampled(points.xyz, _SAMPLED), sampled(points.rgb, _SAMPLED)
+    found = np.array([_at_points(view.loaded(), xyz) for view in sampled_views(views)])
     if not len(found):
         return None
     pixels, contrasts = found[:, 0], found[:, 1]
@@ -76,7 +75,7 @@ def point_fit(views: Sequence[View], points: Points) -> tuple[float, float] | No
     several = count > 1
     if np.count_nonzero(several) < _FEWEST_POINTS:
         return None
-    brightness = np.broadcast_to(_some(points.rgb).mean(axis=1), pixels.shape)
+    brightness = np.broadcast_to(colors.mean(axis=1), pixels.shape)
     contrasts, count = contrasts[:, several], count[several]
     within = np.nansum((contrasts - np.nansum(contrasts, axis=0) / count) ** 2) / np.sum(count - 1)
     overall = np.nanvar(contrasts)
@@ -98,10 +97,7 @@ def _at_points(view: View, xyz: DoubleArray) -> DoubleArray:
     around = image[rows[:, :, None], columns[:, None, :]].mean(axis=3)  # (P, 5, 5)
     center = around[:, _AROUND // 2, _AROUND // 2]
     shown = np.array([center, np.log(center + _FLOOR) - np.log(around + _FLOOR).mean(axis=(1, 2))])
-    if view.mask is not None:
-        shown[:, ~view.mask[row, column]] = np.nan
-    if view.alpha is not None:
-        shown[:, view.alpha[row, column] < OPAQUE] = np.nan
+    shown[:, ~opaque_at(view, (row, column))] = np.nan
     values = np.full((2, len(xyz)), np.nan)
     values[:, index] = shown
     return values
@@ -115,8 +111,3 @@ def _nearest(found: Seen, width: int, height: int) -> tuple[NDArray[np.int64], N
     order = np.lexsort((found.depth[index], cell))
     first = order[np.diff(cell[order], prepend=-1) > 0]
     return index[first], row[first], column[first]
-
-
-def _some(values: NDArray[Number]) -> NDArray[Number]:
-    """Return at most `_SAMPLED` of the values of points, (P, ...), evenly spread in their order."""
-    return values[:: -(-len(values) // _SAMPLED) or 1]

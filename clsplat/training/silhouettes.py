@@ -35,6 +35,19 @@ def transparent_share(views: Sequence[View]) -> float:
     return float(sum((sample < OPAQUE).sum() for sample in samples)) / total if total else 0.0
 
 
+def opaque_at(view: View, at: tuple[NDArray[np.int64], NDArray[np.int64]]) -> NDArray[np.bool_]:
+    """Return whether pixels of a photo show something, (P,): no mask hides them, and they are opaque.
+
+    at : their rows and columns, (P,) each.
+    """
+    shows = np.ones(len(at[0]), np.bool_)
+    if view.mask is not None:
+        shows &= view.mask[at]
+    if view.alpha is not None:
+        shows &= view.alpha[at] >= OPAQUE
+    return shows
+
+
 class Silhouettes:
     """Cameras, and the parts of their photos that show something. Photos without transparency are left out.
 
