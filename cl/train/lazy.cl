@@ -1,4 +1,5 @@
-// lazy.cl: which vectors of splats step, and skipped steps without a step (lazy.clh).
+// lazy.cl: which vectors of splats step, and skipped steps without a step (lazy.clh). All splats change: moments have the
+// capacity of the splats.
 
 // Selects the vectors that step now. A vector steps if one of its splats is visible (depth_key [n],
 // cl/render/project.cl) or if it has the maximum age. ages gets the numbers of skipped steps of the base parameters and
@@ -73,9 +74,9 @@ kernel void settle_color(
     const uint k = get_global_id(1);
     const int2 age = ages[get_global_id(0)];
 #if HALF_MOMENTS
-    const color_moments adam = {sh_moments + i, 0, 0, (uint2)(seed_lo, seed_hi), step, i};
+    const color_moments adam = {sh_moments + i, capacity, lanes_mask(1), 0, 0, (uint2)(seed_lo, seed_hi), step, i};
 #else
-    const color_moments adam = {sh_m + i, sh_v + i, 0, 0};
+    const color_moments adam = {sh_m + i, sh_v + i, capacity, lanes_mask(1), 0, 0};
 #endif
     catch_up_coefficient(k, age.x, decays, k == 0 ? lr : rest_lr, sh + i, adam, capacity, keeps_moments);
 }
@@ -91,7 +92,7 @@ kernel void settle_geometry(
 ) {
     const ulong i = get_global_id(0) * LANES;
     const int2 age = ages[get_global_id(0)];
-    const adam_moments adam = {geom_m + i, geom_v + i, 0, 0};
+    const adam_moments adam = {geom_m + i, geom_v + i, capacity, lanes_mask(1), 0, 0};
     catch_up_part(get_global_id(1), age.x, decays, rates, geom + i, adam, capacity, keeps_moments);
 }
 #ifdef ROW_SKEW
@@ -109,8 +110,8 @@ kernel void settle_skew(
     const ulong i = get_global_id(0) * LANES;
     const int2 age = ages[get_global_id(0)];
     if (age.x < 0) return;
-    const adam_moments adam = {skew_m + i, skew_v + i, 0, 0};
+    const adam_moments adam = {skew_m + i, skew_v + i, capacity, lanes_mask(1), 0, 0};
     catch_up_skew(age.y, decays, lr, skew_s + i, adam, capacity, keeps_moments);
-    if (age.y > 0 || SKEW_ROTATES) write_skew(geom + i, skew_s + i, capacity);
+    if (age.y > 0 || SKEW_ROTATES) write_skew(geom + i, skew_s + i, capacity, capacity, lanes_mask(1));
 }
 #endif

@@ -1,5 +1,6 @@
 // optim.cl: one Adam step of colour, geometry and skew (steps.clh).
 // The NumPy form is clsplat/training/optim/reference.py; a test compares both after each step.
+// The first n_live splats step. Moments and the trainable skew have live_capacity columns.
 
 #ifdef ROW_SKEW
 #if SKEW_ROTATES
@@ -9,11 +10,12 @@ kernel void turn_skew_gradient(
     global const real *restrict geom,
     global real *restrict grad_geom,
     global const real *restrict skew_s,
-    ulong capacity
+    ulong capacity,
+    ulong live_capacity
 ) {
     const ulong i = get_global_id(0) * LANES;
     const unit_quat q = quat_load(geom + ROW_QUAT * capacity + i, capacity);
-    const vec3 a = skew_of(skew_s + i, capacity);
+    const vec3 a = skew_of(skew_s + i, live_capacity);
     const vec3 v = vec3_load(grad_geom + ROW_SKEW * capacity + i, capacity);
     global real *v_quat = grad_geom + ROW_QUAT * capacity + i;
     vreal g[4];
@@ -24,9 +26,15 @@ kernel void turn_skew_gradient(
 }
 
 // Writes the kernel's skew while the trainable skew is frozen.
-kernel void map_skew(global real *restrict geom, global const real *restrict skew_s, ulong capacity) {
+kernel void map_skew(
+    global real *restrict geom,
+    global const real *restrict skew_s,
+    ulong capacity,
+    ulong live_capacity,
+    uint n_live
+) {
     const ulong i = get_global_id(0) * LANES;
-    write_skew(geom + i, skew_s + i, capacity);
+    write_skew(geom + i, skew_s + i, capacity, live_capacity, live_lanes(i, n_live));
 }
 #endif
 #endif
@@ -72,6 +80,8 @@ kernel void step_splats(
 #endif
     constant real *restrict rates,
     ulong capacity,
+    ulong live_capacity,
+    uint n_live,
     uint coefficients,
     uint first_part,
     uint parts,
@@ -87,6 +97,7 @@ kernel void step_splats(
 ) {
     const ulong i = get_global_id(0) * LANES;
     const uint k = get_global_id(1);
+    const vmask live = live_lanes(i, n_live);
 #if LAZY
     const int2 age = ages[get_global_id(0)];
     if ((k * COEFFICIENTS < coefficients || geometry_waits) && age.x < 0) return;
@@ -95,9 +106,11 @@ kernel void step_splats(
     const uint color_items = (coefficients + COEFFICIENTS - 1) / COEFFICIENTS;
     if (k < color_items) {
 #if HALF_MOMENTS
-        const color_moments adam = {sh_moments + i, correct1, correct2, (uint2)(seed_lo, seed_hi), step, i};
+        const color_moments adam = {
+            sh_moments + i, live_capacity, live, correct1, correct2, (uint2)(seed_lo, seed_hi), step, i
+        };
 #else
-        const color_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
+        const color_moments adam = {sh_m + i, sh_v + i, live_capacity, live, correct1, correct2};
 #endif
         UNROLL for (uint j = 0; j < COEFFICIENTS; ++j) {
             const uint c = COEFFICIENTS == SH_COUNT ? j : k * COEFFICIENTS + j;
@@ -110,7 +123,7 @@ kernel void step_splats(
             }
         }
     } else if (k < color_items + parts) {
-        const adam_moments adam = {geom_m + i, geom_v + i, correct1, correct2};
+        const adam_moments adam = {geom_m + i, geom_v + i, live_capacity, live, correct1, correct2};
 #if LAZY
         if (geometry_waits)
             catch_up_part(first_part + k - color_items, skipped.x, decays, rates, geom + i, adam, capacity, false);
@@ -121,7 +134,7 @@ kernel void step_splats(
         );
     } else {
 #ifdef ROW_SKEW
-        const adam_moments adam = {skew_m + i, skew_v + i, skew_correct1, skew_correct2};
+        const adam_moments adam = {skew_m + i, skew_v + i, live_capacity, live, skew_correct1, skew_correct2};
 #if LAZY
         if (geometry_waits) catch_up_skew(skipped.y, decays, skew_lr, skew_s + i, adam, capacity, false);
 #endif

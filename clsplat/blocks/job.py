@@ -55,17 +55,17 @@ def train_block(
     ----------
     scene : with the photos of the block. folder : of the run. device : as for `open_device`.
     """
-    context, background = Splats.load(job.folder / CONTEXT), job.config.background  # as the run decided
+    background = job.config.background  # as the run decided
     exposures = exposures_of_start(str(job.folder / START)) if job.config.appearance.exposure else {}
 
     def targets() -> BlockTargets:
-        inside = Splats.load(job.folder / INSIDE)
+        inside, context = (Splats.load(job.folder / name) for name in (INSIDE, CONTEXT))
         return BlockTargets(inside, context, Renderer(device, keep=2), background, job.uncovered, exposures)
 
     if job.config.cut_background:
         scene = with_cut_outs(scene, background)
     prepared = with_block_targets(replace(scene, background=background), targets)
-    return train_in_folder(job.config.replace(device=device), prepared, folder, context, progress, visit)
+    return train_in_folder(job.config.replace(device=device), prepared, folder, job.folder / CONTEXT, progress, visit)
 
 
 def train_block_on_worker(work: JobContext, job: BlockJob) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def train_in_folder(
     config: TrainConfig,
     scene: Scene,
     folder: Path,
-    context: Splats | None = None,
+    context: Path | None = None,
     progress: Callable[[Progress], None] | None = None,
     visit: Visit | None = None,
 ) -> dict[str, Any]:
@@ -59,7 +59,8 @@ def train_in_folder(
 
     Parameters
     ----------
-    config : complete options. context, progress, visit : as of `train`.
+    config : complete options. context : file of splats, as of `train`; it may be one without splats.
+    progress, visit : as of `train`.
 
     Returns
     -------
@@ -71,7 +72,7 @@ def train_in_folder(
     KeyboardInterrupt : the run was stopped; its checkpoint is saved. Others are those of `train`.
     """
     stored = ModelFolder(folder)
-    file, n_context = stored.checkpoint_path, 0 if context is None else len(context)
+    file, n_context = stored.checkpoint_path, 0 if context is None else len(Splats.load(context))
     try:
         resume = holds_run(stored, config)
         if file.is_file() and not resume and progress is not None:

@@ -20,6 +20,7 @@ from ..splats.splats import Splats
 
 CAPACITY_STEP = 1024  # columns are padded, so that whole groups of 64 items with 16 lanes stay inside
 COMPACT_ROWS = 6  # of `CompactGradients.sh`: the gradient of the colour, and a direction
+_ROWS_AT_ONCE = 8  # rows of a field that are copied together, so that the host holds no second copy of a large field
 
 
 def capacity_for(n: int) -> int:
@@ -59,35 +60,45 @@ class ParameterBuffers:
         for name in arrays:
             field = self.schema[name]
             array = np.asarray(arrays[name], self.dtype)
-            rows = array.reshape(len(array), field.width).T
-            padded = np.zeros((field.width, self.capacity), self.dtype)
-            padded[:, : rows.shape[1]] = rows
-            to_device(self.device, self.buffers[field.group], padded, self._offset_bytes(field.name))
+            columns = array.reshape(len(array), field.width)
+            for row in range(0, field.width, _ROWS_AT_ONCE):
+                part = columns[:, row : row + _ROWS_AT_ONCE].T
+                padded = np.zeros((len(part), self.capacity), self.dtype)
+                padded[:, : part.shape[1]] = part
+                to_device(self.device, self.buffers[field.group], padded, self._offset_bytes(name, row))
 
-    def download(self, n: int, names: Sequence[str] | None = None) -> dict[str, Array]:
-        """Return the arrays of the first n splats, by field."""
+    def download(self, n: int, names: Sequence[str] | None = None, first: int = 0) -> dict[str, Array]:
+        """Return the arrays of n splats from `first` on, by field."""
         arrays: dict[str, Array] = {}
         for name in self.schema.names if names is None else names:
             field = self.schema[name]
-            rows: Array = np.empty((field.width, self.capacity), self.dtype)
-            to_host(self.device, self.buffers[field.group], rows, self._offset_bytes(name))
-            arrays[name] = np.ascontiguousarray(rows[:, :n].T).reshape(public_shape(field, n))
+            array: Array = np.empty((n, field.width), self.dtype)
+            for row in range(0, field.width, _ROWS_AT_ONCE):
+                rows: Array = np.empty((min(_ROWS_AT_ONCE, field.width - row), self.capacity), self.dtype)
+                to_host(self.device, self.buffers[field.group], rows, self._offset_bytes(name, row))
+                array[:, row : row + len(rows)] = rows[:, first : first + n].T
+            arrays[name] = array.reshape(public_shape(field, n))
         return arrays
 
-    def pending(self, n: int, names: Sequence[str] | None = None) -> PendingArrays:
+    def pending(self, n: int, names: Sequence[str] | None = None, first: int = 0) -> PendingArrays:
         """Return what `download` returns, but each field is read when it is asked for."""
 
         def read(name: str) -> Array:
-            return self.download(n, (name,))[name]
+            return self.download(n, (name,), first)[name]
 
         return PendingArrays({name: partial(read, name) for name in (self.schema.names if names is None else names)})
 
-    def _offset_bytes(self, name: str) -> int:
-        return self.schema.offset(name) * self.capacity * self.dtype.itemsize
+    def _offset_bytes(self, name: str, row: int) -> int:
+        return (self.schema.offset(name) + row) * self.capacity * self.dtype.itemsize
 
 
 class SplatBuffers(ParameterBuffers):
-    """Splats on the device; `n` of `capacity` columns are in use."""
+    """Splats on the device; `n` of `capacity` columns are in use.
+
+    Parameters
+    ----------
+    n_frozen : splats that a run shows but does not change (training/context.py), the last ones of all.
+    """
 
     def __init__(
         self,
@@ -95,9 +106,10 @@ class SplatBuffers(ParameterBuffers):
         schema: Schema,
         capacity: int,
         dtype: np.dtype[np.floating],
+        n_frozen: int = 0,
     ) -> None:
         super().__init__(device, schema, capacity, dtype)
-        self.n = 0
+        self.n, self.n_frozen = 0, n_frozen
 
     @classmethod
     def of(
@@ -109,8 +121,18 @@ class SplatBuffers(ParameterBuffers):
     ) -> SplatBuffers:
         """Copy splats to the device, with room for `capacity`."""
         self = cls(device, splats.schema, max(capacity, len(splats)), dtype)
-        self.set(splats.to_numpy())
+        self.set(splats.arrays)
         return self
+
+    @property
+    def n_live(self) -> int:
+        """Number of splats that a run changes: those before the frozen ones."""
+        return self.n - self.n_frozen
+
+    @property
+    def live_capacity(self) -> int:
+        """Number of columns of buffers that only splats before the frozen ones need."""
+        return capacity_for(self.capacity - self.n_frozen)
 
     def set(self, arrays: Mapping[str, Array]) -> None:
         """Replace all splats."""

@@ -37,11 +37,12 @@ class Splats:
         (N, 3), opacity_logit (N,) and sh (N, K, 3) with K = 1, 4, 9 or 16. Quaternions are w, x, y, z of any norm above
         0; scales are natural logs of world units. The shape has fields of its own, such as skew (N, 3). Those that are
         missing get their neutral value.
-        The arrays are copied. They become float32 unless all of them are float64.
+        They become float32 unless all of them are float64.
     normalisation : "peak", "pdf" or "none".
     antialiased : whether the opacity of a small splat falls as the low-pass filter widens it, as in training.
     near_plane : depth below which a splat is not drawn, by its centre [world units].
     low_pass : variance that widens each splat in the image [px²].
+    copy : whether the arrays are copied. Otherwise those of the right type become read-only, and must not change.
 
     Raises
     ------
@@ -66,11 +67,13 @@ class Splats:
         antialiased: bool = False,
         near_plane: float = NEAR_PLANE,
         low_pass: float = LOW_PASS,
+        *,
+        copy: bool = True,
     ) -> None:
         descriptor = shape_named(shape)
         double = all(getattr(values, "dtype", None) == np.float64 for values in arrays.values())
         dtype: np.dtype[Any] = np.dtype(np.float64 if double and arrays else np.float32)
-        fields = {name: _real(name, values, dtype) for name, values in arrays.items()}
+        fields = {name: _real(name, values, dtype, copy) for name, values in arrays.items()}
         schema = descriptor.schema(sh_degree_for(fields))
         n = len(fields["mean"]) if "mean" in fields and fields["mean"].ndim else 0
         for field in descriptor.fields:
@@ -104,7 +107,8 @@ class Splats:
         InputError : the file is missing or damaged, or has another format.
         """
         found = read_splats(path)
-        return cls(found.shape, found.arrays, found.normalisation, found.antialiased, found.near_plane, found.low_pass)
+        numbers = found.near_plane, found.low_pass
+        return cls(found.shape, found.arrays, found.normalisation, found.antialiased, *numbers, copy=False)
 
     def save(self, path: str | os.PathLike[str], compact: bool = False, *, spz_version: int = SPZ_VERSIONS[0]) -> None:
         """Write a .splat, .spz, .sog, .glb or OpenUSD file, or else a PLY file in float32, atomically.
@@ -183,7 +187,8 @@ class Splats:
             "opacity_logit": shape_named(shape).raw_opacity(np.full(n, opacity)),
             "sh": sh,
         }
-        return cls(shape, {name: values.astype(np.float32) for name, values in arrays.items()}, normalisation)
+        single = {name: values.astype(np.float32) for name, values in arrays.items()}
+        return cls(shape, single, normalisation, copy=False)
 
     @property
     def shape(self) -> str:
@@ -274,14 +279,16 @@ class Splats:
         """Return the same splats with another near plane [world units]. Raises InputError if it is not above 0."""
         if depth == self._near_plane:
             return self
-        return Splats(self._shape, self._arrays, self._normalisation, self._antialiased, depth, self._low_pass)
+        numbers = depth, self._low_pass
+        return Splats(self._shape, self._arrays, self._normalisation, self._antialiased, *numbers, copy=False)
 
-    def like(self, shape: str, arrays: Mapping[str, ArrayLike], normalisation: str) -> Splats:
+    def like(self, shape: str, arrays: Mapping[str, ArrayLike], normalisation: str, *, copy: bool = True) -> Splats:
         """Return splats of any shape that are drawn with the antialiasing, near plane and low pass of these.
 
-        Raises InputError as `Splats` does.
+        copy : as of `Splats`. Raises InputError as `Splats` does.
         """
-        return Splats(shape, arrays, normalisation, self._antialiased, self._near_plane, self._low_pass)
+        numbers = self._near_plane, self._low_pass
+        return Splats(shape, arrays, normalisation, self._antialiased, *numbers, copy=copy)
 
     def select(self, indices: ArrayLike) -> Splats:
         """Return the splats at `indices`: whole numbers in any order with repeats, or an (N,) boolean mask.
@@ -300,7 +307,7 @@ class Splats:
             taken = {name: values[chosen] for name, values in self._arrays.items()}
         except IndexError as error:
             raise InputError(f"select: {error}; there are {len(self)} splats") from None
-        return self.with_arrays(taken)
+        return self.like(self._shape, taken, self._normalisation, copy=False)
 
     def as_shape(self, name: str) -> Splats:
         """Return the splats as another shape. Fields that it lacks are dropped; fields that it adds are neutral.
@@ -325,14 +332,19 @@ class Splats:
         return self.like(name, arrays, self._normalisation)
 
 
-def _real(name: str, values: ArrayLike, dtype: np.dtype[Any]) -> Array:
-    """Return a contiguous, real copy of `values`."""
+def _real(name: str, values: ArrayLike, dtype: np.dtype[Any], copy: bool = True) -> Array:
+    """Return `values` as a contiguous array of real numbers, or a copy of them.
+
+    A part of a larger array is always copied, so that the rest does not stay in memory.
+    """
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
             raise TypeError
         with np.errstate(over="ignore"):  # the check finds and names values that overflow
-            return np.array(array, dtype=dtype, order="C")
+            is_whole = array.base is None or getattr(array.base, "nbytes", None) == array.nbytes
+            convert = np.asarray if is_whole and not copy else np.array
+            return convert(array, dtype=dtype, order="C")
     except (TypeError, ValueError):
         raise InputError(f"splats: {name!r} is not an array of real numbers") from None
 

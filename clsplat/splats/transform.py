@@ -66,4 +66,5 @@ def _stacked(parts: Sequence[Splats]) -> Splats:
         [np.pad(part.sh, ((0, 0), (0, coefficients - part.sh.shape[1]), (0, 0))) for part in parts]
     )
     first = next((part for part in parts if len(part)), parts[0])
-    return first.with_arrays(arrays).with_near_plane(min(part.near_plane for part in parts))
+    stacked = first.like(first.shape, arrays, first.normalisation, copy=False)
+    return stacked.with_near_plane(min(part.near_plane for part in parts))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import InputError
 from ..splats.fields import Array
 from .config import TrainConfig
 
@@ -65,7 +66,15 @@ class ParameterAverage:
         """Return the arrays of a checkpoint, by key; empty without a sample."""
         return {**self._mean, "count": np.array([self.count])} if self.count else {}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from the arrays of a checkpoint."""
-        self._mean = {name: values for name, values in state.items() if name != "count"}
+    def load_state(self, state: Mapping[str, Any], n: int) -> None:
+        """Continue from the arrays of a checkpoint of a run with n splats that change.
+
+        Raises
+        ------
+        InputError : the arrays are of fewer splats.
+        """
+        # Earlier versions had means of the splats that do not change, too.
+        self._mean = {name: values[:n] for name, values in state.items() if name != "count"}
+        if any(len(values) != n for values in self._mean.values()):
+            raise InputError("checkpoint: its average is not of the same splats: start with --overwrite")
         self.count = int(state["count"][0]) if state else 0

@@ -61,7 +61,8 @@ class Checkpoint:
     n_first : number of splats at the start of the run, which the growth depends on.
     statistics : densification statistics, (SplatStatistics.ROWS, N).
     reached : limits of the schedules, if the run was made longer.
-    average : state of the `ParameterAverage` by key, empty before the last part of the run.
+    average : state of the `ParameterAverage` by key, empty before the last part of the run. It leaves
+        out the last splats if they do not change.
     left_out : indices of training views that the rest of the run leaves out.
     """
 
@@ -178,9 +179,12 @@ class Checkpoint:
         if any(len(values) != n for values in self.splats.values()) or self.statistics.shape != expected:
             raise ValueError("its arrays are not of the same splats")
         if self.average:
-            shapes = {name: values.shape for name, values in self.average.items() if name != "count"}
-            if shapes != {name: values.shape for name, values in self.splats.items()}:
+            counts = {len(values) for name, values in self.average.items() if name != "count"}
+            shapes = {name: values.shape[1:] for name, values in self.average.items() if name != "count"}
+            if shapes != {name: values.shape[1:] for name, values in self.splats.items()} or max(counts) > n:
                 raise ValueError("its average is not of the same splats")
+            if len(counts) > 1:
+                raise ValueError("its averages are not of the same splats")
             if self.average["count"].shape != (1,) or self.average["count"][0] < 1:
                 raise ValueError("its average has no count")
 

@@ -19,8 +19,8 @@ from .exposure import exposure_bytes
 from .optim.skew_map import SkewMap
 from .targets import target_budget, target_bytes, target_channels
 
-# A parameter has a value, a gradient, two moments and a spare copy. The colour does not have a gradient of full size.
-_ROLES = 5
+# A parameter has a value, a spare copy, a gradient, and two moments if it changes. The colour's gradient is smaller.
+_COPIES, _MOMENTS = 2, 2
 # Planes of an image: colour and transmittance, the same for rendering in bands, gradients of the SSIM maps, v_color.
 _IMAGE_PLANES = 4 + 4 + 9 + 3
 _DEPTH_PLANES = 4 + 4 + 3  # the same for images of depths, without the gradients of the SSIM maps
@@ -75,25 +75,35 @@ class Estimate:
 
 
 def estimate(
-    config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int, splats: int | None = None
+    config: TrainConfig,
+    kernels: KernelBuild,
+    layout: ImageLayout,
+    target_bytes: int,
+    splats: int | None = None,
+    n_frozen: int = 0,
 ) -> Estimate:
     """Return the memory of a run with the largest image.
 
     Parameters
     ----------
     target_bytes : bytes of the photos on the device, and of what belongs to them.
-    splats : largest number of splats; None for that of the options.
+    splats : largest number of splats that change; None for that of the options.
+    n_frozen : splats that do not change (context.py).
     """
-    real, n = kernels.dtype.itemsize, capacity_for(config.cap_max if splats is None else splats)
+    real, live = kernels.dtype.itemsize, config.cap_max if splats is None else splats
+    n, live = capacity_for(live + n_frozen), capacity_for(live)
     rows = {group: kernels.schema.rows(group) for group in Group}
     screen = (kernels.record + kernels.v_record) * real + 4 * (
         _SCREEN_WORDS + _DENSIFY_WORDS + _WAITING_WORDS * config.optim.visible_adam
     )
     isect = isect_bytes(kernels)
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
-    extra = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s and two moments, with spare copies
-    extra += 0 if config.sghmc.position_optimizer == "adam" else 6  # momentum
-    batch = config.schedule.batch
+    state = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s and two moments, with spare copies
+    state += 0 if config.sghmc.position_optimizer == "adam" else 6  # momentum
+    state += (
+        _MOMENTS * rows[Group.GEOM] + (_MOMENTS - config.optim.half_moments) * rows[Group.SH]
+    )  # or one word for both
+    extra, batch = 0, config.schedule.batch
     if batch > 1:  # the mean gradients, and rows that come from another device
         extra += 2 * rows[Group.GEOM] + (batch + 1) * COMPACT_ROWS + SplatStatistics.ROWS
     planes: float = _IMAGE_PLANES
@@ -103,10 +113,9 @@ def estimate(
         # The shorter side of an image of depths is below twice SMALLEST_SIDE, also while the photos are small.
         planes += _DEPTH_PLANES * min(2 * SMALLEST_SIDE / min(layout.width, layout.height), 1.0) ** 2
     widest = max(*rows.values(), kernels.record, kernels.v_record)  # of the buffers with a column for each splat
-    color_roles = _ROLES - 1 - config.optim.half_moments  # two moments of 16 bits are one word
-    splat = _ROLES * rows[Group.GEOM] + color_roles * rows[Group.SH] + COMPACT_ROWS + extra
+    splat = (_COPIES + 1) * rows[Group.GEOM] + _COPIES * rows[Group.SH] + COMPACT_ROWS + extra
     return Estimate(
-        n * (splat * real + screen),
+        n * (splat * real + screen) + live * state * real,
         n_isects * isect,
         int(planes * layout.plane * real) + target_bytes,
         isect,
@@ -114,30 +123,44 @@ def estimate(
     )
 
 
-def run_memory(device: Device, kernels: KernelBuild, config: TrainConfig, views: Sequence[View]) -> Estimate:
-    """Return the memory estimate of a run on these views. Raise DeviceError if the device has too little memory."""
+def run_memory(
+    device: Device, kernels: KernelBuild, config: TrainConfig, views: Sequence[View], n_frozen: int = 0
+) -> Estimate:
+    """Return the memory estimate of a run on these views. Raise DeviceError if the device has too little memory.
+
+    n_frozen : splats that do not change, beside those of the options.
+    """
     largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
     layout = ImageLayout(largest.width, largest.height)
     channels = target_channels(views, config)
     images = target_bytes(views, target_budget(device), channels)
     images += exposure_bytes(layout, kernels.dtype.itemsize, config, channels)
-    needed = estimate(config, kernels, layout, images)
+    needed = estimate(config, kernels, layout, images, n_frozen=n_frozen)
     needed = replace(
         needed,
         available=device.info.global_mem_bytes,
-        most_splats=most_splats(config, kernels, layout, images, device.info),
+        most_splats=most_splats(config, kernels, layout, images, device.info, n_frozen),
     )
     check(needed, device)
     return needed
 
 
 def most_splats(
-    config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int, info: DeviceInfo
+    config: TrainConfig,
+    kernels: KernelBuild,
+    layout: ImageLayout,
+    target_bytes: int,
+    info: DeviceInfo,
+    n_frozen: int = 0,
 ) -> int:
-    """Return the largest number of splats with which a run fits a device, a multiple of 1024; 0 if none fits."""
+    """Return the largest number of splats with which a run fits a device, a multiple of 1024; 0 if none fits.
+
+    n_frozen : splats that do not change. They are not counted.
+    """
 
     def fits(steps: int) -> bool:
-        return fault(estimate(config, kernels, layout, target_bytes, steps * CAPACITY_STEP), info) is None
+        found = estimate(config, kernels, layout, target_bytes, steps * CAPACITY_STEP, n_frozen)
+        return fault(found, info) is None
 
     low, high = 0, _MOST_SPLATS // CAPACITY_STEP  # low fits or is 0, high does not fit
     while high - low > 1:

@@ -32,6 +32,7 @@ class Replica:
     ----------
     memory : the estimate of the run's memory on this device.
     first : the splats at the start. capacity : the largest number of splats.
+    n_frozen : splats that do not change, the last ones (context.py).
 
     Attributes
     ----------
@@ -51,11 +52,12 @@ class Replica:
         config: TrainConfig,
         first: Mapping[str, Array],
         capacity: int,
+        n_frozen: int = 0,
     ) -> None:
         self.device, self.kernels, self.scene, self.config = device, kernels, scene, config
         max_isects = min(isect_limit(device, kernels), room_for_isects(memory, device.info))
         self.pipeline = Pipeline(device, kernels, max_isects)
-        self.splats = SplatBuffers(device, kernels.schema, capacity, kernels.dtype)
+        self.splats = SplatBuffers(device, kernels.schema, capacity, kernels.dtype, n_frozen)
         self.splats.set(first)
         self.grads = CompactGradients(device, self.splats.schema, capacity, kernels.dtype)
         self.loss = ImageLoss(self.pipeline.pool, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)

@@ -44,7 +44,7 @@ def train(
     resume: bool = False,
     overwrite: bool = False,
     visit: Visit | None = None,
-    context: Splats | None = None,
+    context: Splats | Path | None = None,
 ) -> Model:
     """Train a splat model on a scene's training views and return it.
 

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from .batch import Batch, Photo, check_batch
 from .checkpoint import Checkpoint
 from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
-from .context import FrozenSplats, check_context
+from .context import check_context
 from .density.control import DensityControl, ExplorationNoise
 from .exposure_file import exposures_json
 from .extension import reached_by
@@ -69,7 +70,7 @@ class Trainer:
     scene : with the option `validate`, some of its training views become validation views.
     checkpoint : state to continue from.
     progress : called with messages and with the progress of the run.
-    context : splats that are shown and do not change (context.py). They are the last ones of the result.
+    context : splats that are shown and do not change (context.py), or their file. They are the last ones of the result.
 
     Raises
     ------
@@ -84,10 +85,10 @@ class Trainer:
         checkpoint: Checkpoint | None = None,
         progress: Callable[[Progress], None] | None = None,
         device: Device | None = None,
-        context: Splats | None = None,
+        context: Splats | Path | None = None,
     ) -> None:
+        context = Splats.load(context) if isinstance(context, Path) else context
         check_context(context, config, checkpoint)
-        self.context = context
         scene = split_for_run(scene, config.validation.validate)
         if not scene.train:
             raise InputError(f"{scene.path}: no training views: all are test views")
@@ -102,16 +103,15 @@ class Trainer:
         check_batch(config, 1 + len(others))
         schedule = schedule_for(self.device, checkpoint.schedule if checkpoint else None)
         self.kernels = kernel_build(config, schedule)
-        n_frozen = 0 if context is None else len(context)
-        whole = config.replace(cap_max=config.cap_max + n_frozen)
-        self.memory = run_memory(self.device, self.kernels, whole, scene.train)
+        self.n_frozen = 0 if context is None else len(context)
+        self.memory = run_memory(self.device, self.kernels, config, scene.train, self.n_frozen)
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0
         new = partial(first_arrays, scene, config, self.kernels.near_plane, context)
         first, message = new() if checkpoint is None else self._stored_splats(checkpoint)
         self._send(f"{message}; about {self.memory}")
         self.reached = reached_by(checkpoint, config, scene.train) if checkpoint else None
-        self.n_first = checkpoint.n_first if checkpoint else len(first["mean"]) - (len(context) if context else 0)
+        self.n_first = checkpoint.n_first if checkpoint else len(first["mean"]) - self.n_frozen
         self._create_device_state(first, others)
         if checkpoint is not None:
             self._load_state(checkpoint)
@@ -127,7 +127,7 @@ class Trainer:
         self.schedule = RunSchedule.create(config, self.n_first)
         self.average = ParameterAverage(config, self.schedule.densify_last)
         if checkpoint is not None and checkpoint.config["iterations"] == config.iterations:
-            self.average.load_state(checkpoint.average)
+            self.average.load_state(checkpoint.average, self.splats.n_live)
         self.density = DensityControl(
             config,
             self.kernels,
@@ -138,7 +138,6 @@ class Trainer:
             self.rng,
             scene.extent,
             len(scene.train),
-            self.frozen,
         )
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
         self.running = RunningLoss(len(scene.train))
@@ -160,15 +159,13 @@ class Trainer:
     def _create_device_state(self, first: Mapping[str, Array], others: Sequence[Device]) -> None:
         """Create the splats of each device with what makes their gradients, and the optimizer of the first one."""
         config = self.config
-        n_frozen = 0 if self.context is None else len(self.context)
-        capacity = max(config.cap_max + n_frozen, len(first["mean"]))
-        main = Replica(self.device, self.kernels, self.memory, self.scene, config, first, capacity)
+        capacity = max(config.cap_max + self.n_frozen, len(first["mean"]))
+        main = Replica(self.device, self.kernels, self.memory, self.scene, config, first, capacity, self.n_frozen)
         self.pipeline, self.splats, self.grads, self.dropout = main.pipeline, main.splats, main.grads, main.dropout
         self.loss, self.targets, self.exposure = main.loss, main.targets, main.exposure
         self.main, self.batch = main, None
         if config.schedule.batch > 1:
             self.batch = Batch([main, *(main.copy_on(device, first) for device in others)], config)
-        self.frozen = FrozenSplats(self.kernels, self.splats, n_frozen) if n_frozen else None
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, self.scene.extent)
 
     def _load_state(self, checkpoint: Checkpoint) -> None:
@@ -305,8 +302,6 @@ class Trainer:
         else:
             frame, self._losses = self.batch.learn(photos, degree, it)
             grads = self.batch.grads
-        if self.frozen is not None:
-            self.frozen.clear(grads)
         mean_lr = self.scene.extent * self.schedule.mean_rate(it)
         self.optimizer.step(grads, mean_lr * config.rate_factor("mean"), degree, it, depth_key)
         if self.density.is_due(it):
@@ -343,13 +338,16 @@ class Trainer:
         After the last iteration they are the mean over the last part of the run (option `average_last`).
         """
         arrays = self.average.result() if self.has_mean else dict(self.optimizer.read())
+        if self.n_frozen:
+            frozen = self.splats.pending(self.n_frozen, first=self.splats.n_live)
+            arrays = {name: np.concatenate([array, frozen[name]]) for name, array in arrays.items()}
         sound = finite_rows(arrays)
         if len(sound) and not sound.any():
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")
         kept, kernels = arrays if sound.all() else {name: array[sound] for name, array in arrays.items()}, self.kernels
         numbers = kernels.near_plane, kernels.low_pass
         try:
-            return Splats(kernels.shape, kept, kernels.normalisation, kernels.antialiased, *numbers)
+            return Splats(kernels.shape, kept, kernels.normalisation, kernels.antialiased, *numbers, copy=False)
         except InputError as error:
             raise TrainingError(f"iteration {self.iteration}: {error}: lower the learning rates") from None
 
@@ -388,7 +386,7 @@ class Trainer:
         if self.progress is not None:
             loss, psnr = self.running.means()
             speed = (self.iteration - since) / (time.perf_counter() - started)
-            counts = self.splats.n if self.frozen is None else self.frozen.n_live, self.seconds, speed
+            counts = self.splats.n_live, self.seconds, speed
             left = self.clock.forecast.seconds_left()
             self.progress(Progress(self.iteration, self.config.iterations, loss, psnr, *counts, forecast=left))
 

@@ -100,6 +100,19 @@ def test_immutable_and_copied() -> None:
     np.testing.assert_array_equal(splats.mean, kept["mean"])
 
 
+def test_arrays_may_be_kept_instead_of_copied() -> None:
+    """A part of a larger array is copied nevertheless."""
+    arrays = random_arrays("skew-normal", 4, 1, seed=0)
+    larger = random_arrays("skew-normal", 9, 1, seed=0)["mean"]
+    splats = Splats("skew-normal", arrays | {"mean": larger[:4]}, copy=False)
+    for name, values in arrays.items():
+        assert np.shares_memory(splats.arrays[name], values) == (name != "mean")
+        assert values.flags.writeable == (name == "mean")
+    assert not np.shares_memory(splats.mean, larger)
+    moved = splats.with_near_plane(0.5)
+    assert all(moved.arrays[name] is values for name, values in splats.arrays.items()), "they do not change"
+
+
 def test_real_type_is_kept_only_when_all_are_double() -> None:
     arrays = random_arrays("gaussian", 3, 0, seed=0, dtype=np.float64)
     assert {a.dtype for a in Splats("gaussian", arrays).arrays.values()} == {np.dtype("f8")}

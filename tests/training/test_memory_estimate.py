@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyopencl as cl
 import pytest
 from small_scene import write_garden
@@ -29,6 +30,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "lazy steps": {"shape": "gaussian", "visible_adam": True},
     "half moments": {"shape": "gaussian", "half_moments": True},
     "smooth depths": {"shape": "skew-normal", "depth_smoothness": 0.1},
+    "context": {"shape": "skew-normal", "strategy": "adc", "opacity_reg": 0.0, "scale_reg": 0.0, "opacity_reset": 0},
     "momentum": {"shape": "student-t", "position_optimizer": "sghmc"},
 }
 
@@ -72,8 +74,12 @@ def check_allocations(device: Device, tmp_path: Path, monkeypatch: pytest.Monkey
     config = TrainConfig(iterations=24, cap_max=20_000, densify_interval=6, sh_degree=2, **RUNS[name])
     scene = load_scene(write_garden(tmp_path))
     schedule_for(device)  # the first use of a device allocates for its self-test
+    context = None
+    if name == "context":
+        few = Trainer(scene, config, device=device).snapshot()
+        context = few.select(np.arange(30_000) % len(few))
     monkeypatch.setattr(cl, "Buffer", CountedBuffer)
-    trainer = Trainer(scene, config, device=device)
+    trainer = Trainer(scene, config, device=device, context=context)
     for _ in range(config.iterations):
         trainer.step()
     trainer.device.finish()

@@ -10,7 +10,6 @@ from ...errors import TrainingError
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import SplatBuffers, SplatStatistics
 from ..config import TrainConfig
-from ..context import FrozenSplats, LiveSplats
 from ..methods.sns import learning_groups
 from ..optim.noise import noise_amount, noise_reach
 from ..optim.optimizer import Optimizer
@@ -19,7 +18,6 @@ from ..schedules import RunSchedule
 from .edit import DensifyEdit
 from .on_device import DeviceSplats
 from .strategy import StepInfo, next_edit
-from .table import SplatTable
 
 
 class DensityControl:
@@ -31,7 +29,6 @@ class DensityControl:
     rng : generator of the run.
     extent : extent of the scene [world units].
     photos : number of training photos.
-    frozen : the splats that do not change (training/context.py); None without any.
     """
 
     def __init__(
@@ -45,9 +42,7 @@ class DensityControl:
         rng: np.random.Generator,
         extent: float,
         photos: int,
-        frozen: FrozenSplats | None = None,
     ) -> None:
-        self.frozen = frozen
         self.config, self.schedule, self.splats, self.optimizer = config, schedule, splats, optimizer
         self.statistics, self.rng, self.extent = statistics, rng, extent
         self.kernels, self.photos = kernels, photos
@@ -77,28 +72,23 @@ class DensityControl:
                 "check the start (init) and the learning rates"
             )
         self._empty = 0
-        table: SplatTable = DeviceSplats(self.splats, columns_program(self.splats.device, self.kernels))
-        if self.frozen is not None:
-            table, statistics = LiveSplats(table, self.frozen.n_live), statistics[:, : self.frozen.n_live]
-        edit = next_edit(self.config, table, statistics, self.rng, info)
-        if self.frozen is not None:
-            edit = self.frozen.with_frozen(edit)
+        table = DeviceSplats(self.splats, columns_program(self.splats.device, self.kernels))
+        edit = next_edit(self.config, table, statistics[:, : self.splats.n_live], self.rng, info)
         self.optimizer.apply(self.optimizer.arranged(edit))
         self.statistics.reset()
 
     def remove(self, gone: NDArray[np.bool_]) -> None:
         """Remove splats. gone : (N,). The statistics of the others stay. Frozen splats are never removed."""
-        gone = gone.copy()
-        if self.frozen is not None:
-            gone[self.frozen.n_live :] = False
-        if not gone.any() or gone.all():
+        frozen = np.arange(self.splats.n_live, self.splats.n)
+        gone = gone[: self.splats.n_live]
+        if not gone.any() or (gone.all() and not len(frozen)):
             return
         self.optimizer.settle()
         kept, statistics = np.flatnonzero(~gone), self.statistics.read(self.splats.n)
         fresh = np.zeros(len(kept), np.bool_)
         edit = self.optimizer.arranged(DensifyEdit(kept, {}, fresh, state_source=kept, removed=int(gone.sum())))
         self.optimizer.apply(edit)
-        self.statistics.write(statistics[:, edit.source], self.splats.capacity)
+        self.statistics.write(statistics[:, np.concatenate([edit.source, frozen])], self.splats.capacity)
 
 
 class ExplorationNoise:

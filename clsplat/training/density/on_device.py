@@ -14,7 +14,7 @@ from .table import Summary
 
 
 class DeviceSplats:
-    """Splats on the device as a `SplatTable`. It equals `HostSplats` to the bit.
+    """The splats on the device that a run changes, as a `SplatTable`. It equals `HostSplats` to the bit.
 
     program : programs.columns_program.
     """
@@ -24,12 +24,12 @@ class DeviceSplats:
         self.columns = Columns(splats.device, program, splats.capacity, splats.dtype)
 
     def summary(self) -> Summary:
-        splats = self.splats
-        rows: Array = np.empty((2, splats.n), splats.dtype)
-        if splats.n:
+        splats, n = self.splats, self.splats.n_live
+        rows: Array = np.empty((2, n), splats.dtype)
+        if n:
             buffer = splats.device.alloc(rows.nbytes)
             self.program.summarise_splats.over(
-                splats.n, geom=splats.geom, sh=splats.sh, summary=buffer, capacity=splats.capacity, n=splats.n
+                n, geom=splats.geom, sh=splats.sh, summary=buffer, capacity=splats.capacity, n=n
             )
             to_host(splats.device, buffer, rows)
         return Summary(*rows)
@@ -47,4 +47,4 @@ class DeviceSplats:
         }
 
     def field(self, name: str) -> Array:
-        return self.splats.download(self.splats.n, (name,))[name]
+        return self.splats.download(self.splats.n_live, (name,))[name]

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...device.device import Device
-from ...device.memory import fill_zero, to_device, to_host
+from ...device.memory import copy, fill_zero, to_device, to_host
 from ...device.pending_arrays import PendingArrays
 from ...device.program import GROUP_ITEMS, Program, lane_group
 from ...rendering.build import KernelBuild
-from ...rendering.splat_buffers import CompactGradients, SplatBuffers
+from ...rendering.splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
 from ...splats.fields import Array, Group, Schema, sh_coefficients
 from ..columns import Columns
 from ..density.edit import DensifyEdit
@@ -30,7 +30,7 @@ class StateRows:
     """A buffer [width, capacity] of optimizer state, which starts at zero. Its arrays on the host are (n, width)."""
 
     def __init__(self, splats: SplatBuffers, width: int) -> None:
-        self.device, self.width, self.capacity, self.dtype = splats.device, width, splats.capacity, splats.dtype
+        self.device, self.width, self.capacity, self.dtype = splats.device, width, splats.live_capacity, splats.dtype
         self.buffer, self.spare = (self.device.alloc(self.nbytes) for _ in range(2))
         fill_zero(self.device, self.buffer, self.nbytes)
 
@@ -57,23 +57,27 @@ class TrainableSkew:
     def __init__(self, splats: SplatBuffers, skew_map: SkewMap) -> None:
         self.map, self.steps = skew_map, 0
         self.s, self.first, self.second = (StateRows(splats, skew_map.width) for _ in range(3))
-        values = splats.download(splats.n, ("skew", "quat"))
+        values = splats.download(splats.n_live, ("skew", "quat"))
         self.s.set(skew_map.inverse(values["skew"], values["quat"]))
 
 
 class FusedOptimizer:
-    """`Optimizer` (optim/optimizer.py) whose steps run on the device."""
+    """`Optimizer` (optim/optimizer.py) whose steps run on the device.
+
+    Its state has columns for the splats that change. Frozen ones are behind them in the buffers of the splats.
+    """
 
     def __init__(self, device: Device, kernels: KernelBuild, splats: SplatBuffers, rules: Rules) -> None:
         self.device, self.kernels, self.splats, self.rules = device, kernels, splats, rules
         half = rules.config.optim.half_moments
         self.program: Program = optim_program(device, kernels, half, rules.config.schedule.batch)
         self._group = lane_group(device)
-        self.columns = Columns(device, columns_program(device, kernels), splats.capacity, splats.dtype)
+        program, capacities = columns_program(device, kernels), (splats.capacity, splats.live_capacity)
+        self.columns, self._state = (Columns(device, program, each, splats.dtype) for each in capacities)
         self.steps = 0
         schema, dtype = splats.schema, splats.dtype
-        # Moments have the size of the splat buffers, so one spare buffer serves all. The rows of the skew are not used.
-        self.moments = AdamMoments(device, schema, splats.capacity, dtype, half)
+        # The rows of the skew are not used, so that moments and splats have the same rows.
+        self.moments = AdamMoments(device, schema, splats.live_capacity, dtype, half)
         self.spare = {group: device.alloc(splats.group_bytes(group)) for group in Group}
         self.skew = TrainableSkew(splats, rules.map) if rules.map is not None else None
         self.momentum = StateRows(splats, 3) if rules.sghmc is not None else None
@@ -106,7 +110,7 @@ class FusedOptimizer:
         if with_skew and (follows or not groups.base):
             self._step(arguments, True)
         elif follows and not with_skew and skew is not None:
-            self._launch("map_skew", skew_s=skew.s.buffer)
+            self._launch("map_skew", skew_s=skew.s.buffer, n_live=self.splats.n_live)
 
     def settle(self) -> None:
         """Do nothing: this optimizer skips no steps."""
@@ -115,11 +119,12 @@ class FusedOptimizer:
         return edit
 
     def read(self) -> PendingArrays:
-        return self.splats.pending(self.splats.n)
+        return self.splats.pending(self.splats.n_live)
 
     def apply(self, edit: DensifyEdit) -> None:
-        splats, n_old, n_new = self.splats, self.splats.n, len(edit.source)
-        source = self.columns.indices(edit.source)
+        splats, n_old, n_new = self.splats, self.splats.n_live, len(edit.source)
+        # Frozen splats stay behind the others.
+        source = self.columns.indices(np.concatenate([edit.source, np.arange(n_old, splats.n)]))
         fresh = edit.fresh.copy()
         state_source = None
         if edit.state_source is None:
@@ -131,20 +136,18 @@ class FusedOptimizer:
         to_device(self.device, fresh_buffer, fresh.view(np.uint8))
         for group in Group:
             rows = splats.schema.rows(group)
-            splats.buffers[group], self.spare[group] = self._gather(
-                splats.buffers[group], source, self.spare[group], n_new, rows
-            )
+            self.columns.gather(splats.buffers[group], source, self.spare[group], n_new + splats.n_frozen, rows)
+            self._swap(splats, group)
             for moments in self.moments.of(group):
                 if state_source is not None:
-                    moments.buffers[group], self.spare[group] = self._gather(
-                        moments.buffers[group], state_source, self.spare[group], n_new, rows
-                    )
-                self.columns.zero(moments.buffers[group], fresh_buffer, n_new, rows)
+                    self._state.gather(moments.buffers[group], state_source, self.spare[group], n_new, rows)
+                    self._swap(moments, group)
+                self._state.zero(moments.buffers[group], fresh_buffer, n_new, rows)
         for state in self._other_state():
             if state_source is not None:
                 self._gather_rows(state, state_source, n_new)
-            self.columns.zero(state.buffer, fresh_buffer, n_new, state.width)
-        splats.n = n_new
+            self._state.zero(state.buffer, fresh_buffer, n_new, state.width)
+        splats.n = n_new + splats.n_frozen
         self._set_values(edit, source)
         self._reset_fields(edit.reset_fields)
 
@@ -155,11 +158,13 @@ class FusedOptimizer:
             rows |= {"skew_s": self.skew.s, "first.skew": self.skew.first, "second.skew": self.skew.second}
         if self.momentum is not None:
             rows["momentum"] = self.momentum
-        n = self.splats.n
+        n = self.splats.n_live
         others = PendingArrays({name: partial(each.get, n) for name, each in rows.items()})
         return PendingArrays.of(steps, self.moments.state(n, self._base_names), others)
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        if self.splats.n_frozen:  # earlier versions had a state of frozen splats, which was zero
+            state = {name: rows if name == "steps" else rows[: self.splats.n_live] for name, rows in state.items()}
         check_state(state, self.state())
         self.steps = int(state["steps"][0])
         self.moments.load_state(state, self._base_names)
@@ -178,8 +183,8 @@ class FusedOptimizer:
 
     @property
     def _columns(self) -> int:
-        """Work-items of a kernel over all splats."""
-        return -(-self.splats.n // (self.kernels.lanes * GROUP_ITEMS)) * GROUP_ITEMS
+        """Work-items of a kernel over all splats that change."""
+        return -(-self.splats.n_live // (self.kernels.lanes * GROUP_ITEMS)) * GROUP_ITEMS
 
     def _step(
         self, arguments: dict[str, Any], with_skew: bool, coefficients: int = 0, first_part: int = 0, parts: int = 0
@@ -198,7 +203,7 @@ class FusedOptimizer:
 
     def _arguments(self, grads: CompactGradients, mean_lr: float, sh_degree: int) -> dict[str, Any]:
         """Return the arguments of the kernel `step_splats`, except what it steps."""
-        penalty, skew = self.rules.penalty(self.splats.n), self.skew
+        penalty, skew = self.rules.penalty(self.splats.n_live), self.skew
         arguments = {
             "sh": self.splats.sh,
             "grad_sh": grads.sh,
@@ -209,6 +214,8 @@ class FusedOptimizer:
             "geom_v": self.moments.second.geom,
             "rates": self.rates,
             "capacity": self.splats.capacity,
+            "live_capacity": self.splats.live_capacity,
+            "n_live": self.splats.n_live,
             "sh_degree": sh_degree,
             "mean_lr": mean_lr,
             "opacity_scale": penalty.opacity,
@@ -224,8 +231,9 @@ class FusedOptimizer:
         return arguments
 
     def _launch(self, name: str, **arguments: Any) -> None:
-        """Run a kernel over the geometry of all splats."""
-        self.program[name].over(self._columns, geom=self.splats.geom, capacity=self.splats.capacity, **arguments)
+        """Run a kernel over the geometry of all splats that change."""
+        capacities = {"capacity": self.splats.capacity, "live_capacity": self.splats.live_capacity}
+        self.program[name].over(self._columns, geom=self.splats.geom, **capacities, **arguments)
 
     def _sghmc(
         self, sghmc: Sghmc, momentum: StateRows, grads: CompactGradients, mean_lr: float, iteration: int
@@ -268,19 +276,19 @@ class FusedOptimizer:
             self.columns.put(self.splats.buffers[field.group], target, values, schema.offset(name))
         if self.skew is not None and followers is not None:
             rows, before = followers
-            s = self.columns.take(self.skew.s.buffer, rows, len(before["quat"]), 0, self.skew.s.width)
+            s = self._state.take(self.skew.s.buffer, rows, len(before["quat"]), 0, self.skew.s.width)
             s = self.skew.map.follow(s, before, self._skew_and_quat(rows, len(s)))
-            self.columns.put(self.skew.s.buffer, rows, s, 0)
+            self._state.put(self.skew.s.buffer, rows, s, 0)
 
     def _followers(self, edit: DensifyEdit, source: Any) -> tuple[Any, dict[str, Array]] | None:
         """Move the trainable skew. Return the rows with a new skew or rotation, and both before they change."""
         if self.skew is None:
             return None
-        self._gather_rows(self.skew.s, source, self.splats.n)
+        self._gather_rows(self.skew.s, source, self.splats.n_live)
         rows = [edit.values[name].rows for name in ("skew", "quat") if name in edit.values]
         if not rows:
             return None
-        marked = np.zeros(self.splats.n, np.bool_)  # np.unique hashes its values, which takes many times as long
+        marked = np.zeros(self.splats.n_live, np.bool_)  # np.unique hashes its values, which takes many times as long
         for each in rows:
             marked[each] = True
         changed = np.flatnonzero(marked)
@@ -296,20 +304,23 @@ class FusedOptimizer:
         }
 
     def _reset_fields(self, names: tuple[str, ...]) -> None:
-        self.moments.reset(self.splats.n, names)
+        self.moments.reset(self.splats.n_live, names)
         if self.skew is not None and "skew" in names:
             for rows in (self.skew.first, self.skew.second):
                 rows.set(np.zeros((0, rows.width)))
         if self.momentum is not None and "mean" in names:
             self.momentum.set(np.zeros((0, 3)))
 
-    def _gather(self, values: Any, source: Any, spare: Any, n: int, rows: int) -> tuple[Any, Any]:
-        """Return the gathered buffer, and the other one, which is now the spare."""
-        self.columns.gather(values, source, spare, n, rows)
-        return spare, values
+    def _swap(self, values: ParameterBuffers, group: Group) -> None:
+        """Take the spare buffer of a group for the present one. If it is larger, because of frozen splats, copy it."""
+        if values.capacity == self.splats.capacity:
+            values.buffers[group], self.spare[group] = self.spare[group], values.buffers[group]
+        else:
+            copy(self.device, self.spare[group], values.buffers[group], values.group_bytes(group))
 
     def _gather_rows(self, rows: StateRows, source: Any, n: int) -> None:
-        rows.buffer, rows.spare = self._gather(rows.buffer, source, rows.spare, n, rows.width)
+        self._state.gather(rows.buffer, source, rows.spare, n, rows.width)
+        rows.buffer, rows.spare = rows.spare, rows.buffer
 
 
 def bias_corrections(steps: int) -> dict[str, float]:

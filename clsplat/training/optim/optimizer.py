@@ -50,13 +50,13 @@ class Optimizer(Protocol):
         """Return the edit with its rows in the best order for this optimizer. Call `settle` before."""
 
     def read(self) -> Mapping[str, Array]:
-        """Return the public arrays of the splats with all skipped steps done; the state does not change.
+        """Return the public arrays of the splats that change, with all skipped steps done; the state does not change.
 
         They are copies. Those on the device are read when they are asked for, which must be before the next step.
         """
 
     def apply(self, edit: DensifyEdit) -> None:
-        """Settle, then move, add, remove and reset splats."""
+        """Settle, then move, add, remove and reset splats. The edit is one of those that change."""
 
     def state(self) -> Mapping[str, NDArray[Any]]:
         """Return the state for a checkpoint, without the splats. Both optimizers use the same keys.
