@@ -178,9 +178,9 @@ static inline void solve_exposure(local const real *sums, real pull, real *expos
 }
 
 // Moves the exposure of a view by the fraction `rate` towards the least-squares exposure. `pull`, a fraction of the
-// pixels, draws the latter to the identity. Then all exposures are shifted so that their mean stays. The mean must be
-// fixed, because a gain of all photos and its inverse in all splats give the same images. Views without a photo have
-// the mean exposure.
+// pixels, draws the latter to the identity. Then all exposures are shifted so that the mean of `held` of them stays. The
+// mean must be fixed, because a gain of all photos and its inverse in all splats give the same images. Views without a
+// photo have the mean exposure. `held` is the number of views with a mean to keep, or 0 if the view is not one of them.
 // exposures [views, EXPOSURE], in place. One group of EXPOSURE_GROUP work-items.
 kernel void step_exposure(
     global real *restrict exposures,
@@ -188,6 +188,7 @@ kernel void step_exposure(
     int parts,
     int view,
     int views,
+    int held,
     real rate,
     real pull
 ) {
@@ -215,6 +216,6 @@ kernel void step_exposure(
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int at = item; at < EXPOSURE * views; at += EXPOSURE_GROUP) {
         const int j = at % EXPOSURE;
-        exposures[at] += (at / EXPOSURE == view ? moved[j] : 0) - moved[j] / views;
+        exposures[at] += (at / EXPOSURE == view ? moved[j] : 0) - (held > 0 ? moved[j] / held : 0);
     }
 }

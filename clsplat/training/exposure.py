@@ -2,10 +2,11 @@
 
 The exposure of a photo is an affine map from the colours of the render to the colours of the photo, as in 3DGS. It does
 not change the background behind a transparent photo, which no camera took. Each time a view is trained, its exposure
-moves a fixed fraction towards the least-squares fit of the current render. The mean over all views is kept at the
-identity, which is also used for novel views. 3DGS learns exposures by Adam instead; the comparison is in
-docs/decisions.md. A run that begins with a model begins with the exposures of that model. Runs without exposures, masks
-and transparency launch none of these kernels.
+moves a fixed fraction towards the least-squares fit of the current render. The mean over the usual views is kept at the
+identity, which is also used for novel views. A few much darker or brighter photos are not usual
+(`exposure_hint.usual_exposures`): they would move the colours of the whole model. 3DGS learns exposures by Adam
+instead; the comparison is in docs/decisions.md. A run that begins with a model begins with the exposures of that model.
+Runs without exposures, masks and transparency launch none of these kernels.
 """
 
 from __future__ import annotations
@@ -37,12 +38,21 @@ class PhotoLoss:
     Parameters
     ----------
     background : colour under transparent photos in `targets`.
+    usual : whether the exposure of each target is among those whose mean is kept, (views,). None: all are.
     """
 
-    def __init__(self, loss: ImageLoss, targets: Targets, config: TrainConfig, background: Color) -> None:
+    def __init__(
+        self,
+        loss: ImageLoss,
+        targets: Targets,
+        config: TrainConfig,
+        background: Color,
+        usual: NDArray[np.bool_] | None = None,
+    ) -> None:
         self.loss, self.targets, self.config, self.background = loss, targets, config, background
         self.device, self.kernels = loss.device, loss.kernels
         self.learns = config.appearance.exposure
+        self.usual = np.ones(len(targets.views), np.bool_) if usual is None else usual
         self.in_use = needs_exposure(config, targets.channels)
         if not self.in_use:
             return
@@ -125,6 +135,7 @@ class PhotoLoss:
             parts=parts,
             view=view,
             views=len(self.targets.views),
+            held=int(np.count_nonzero(self.usual)) if self.usual[view] else 0,
             rate=self.config.appearance.exposure_rate,
             pull=self.config.appearance.exposure_pull,
         )

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 LARGE_SPREAD = 0.6  # stops; captures with one exposure have 0.1 to 0.5
 _SMALL_SPREAD = 0.35  # stops; a smaller spread costs little
 _UNEXPLAINED = 0.82  # of the differences between photos; reflections and what hides points leave more
+_UNUSUAL, _FEW = 1.5, 0.25  # stops from the median, and the largest share of such photos
 _FEWEST_TO_FIT = 12  # photos: with fewer, most points are in so few that exposures explain anything
 _ROUNDS = 5  # of the fit; further ones change it by less than a hundredth
 _GAMMA = 2.2  # of photos: stops are factors of light, not of pixels
@@ -44,20 +45,48 @@ def exposure_hint(scene: Scene, config: TrainConfig) -> str | None:
 def exposure_spread(views: Sequence[View], points: Points) -> float | None:
     """Return the standard deviation of the photos' exposures [stops]; None if too few photos show enough points.
 
-    A photo's exposure is the median factor between its pixels at the points and the points' own colours, in each
-    channel. The result is that of the channel that differs most: casts of colour are exposures, too.
+    The result is that of the channel that differs most: casts of colour are exposures, too.
     """
-    if len(points) and np.ptp(points.rgb.astype(int), axis=0).max() <= SPREAD:
-        return None  # points without colours say nothing about the photos
+    stops = photo_stops(sampled_views(views), points)
+    stops = stops[np.isfinite(stops).all(axis=1)]
+    return float(np.std(stops, axis=0).max()) if len(stops) >= _FEWEST_PHOTOS else None
+
+
+def usual_exposures(views: Sequence[View], points: Points) -> NDArray[np.bool_]:
+    """Return which photos have about the exposure of most, (V,).
+
+    All have if more than a quarter would not. So has a photo whose exposure the points do not tell.
+    """
+    stops = photo_stops(views, points)
+    known, usual = np.isfinite(stops).all(axis=1), np.ones(len(views), np.bool_)
+    usual[np.isinf(stops).any(axis=1)] = False
+    if known.any():
+        usual[known] = (np.abs(stops[known] - np.median(stops[known], axis=0)) <= _UNUSUAL).all(axis=1)
+    return usual if np.count_nonzero(~usual) <= _FEW * len(views) else np.ones_like(usual)
+
+
+def photo_stops(views: Sequence[View], points: Points) -> DoubleArray:
+    """Return the exposures of photos against the colours of the points [stops], (V, 3).
+
+    A photo's exposure is the median factor between its pixels at the points and the points' own colours, in each
+    channel. It is infinite if most of these pixels are black or white, so that too few are left. It is NaN if the photo
+    shows too few points, or if all points have one colour.
+    """
+    stops: DoubleArray = np.full((len(views), 3), np.nan)
+    if not len(points) or np.ptp(points.rgb.astype(int), axis=0).max() <= SPREAD:
+        return stops  # points without colours say nothing about the photos
     xyz, colors = sampled(points.xyz), sampled(points.rgb.astype(np.float64))
-    stops = []
-    for view in sampled_views(views):
+    for number, view in enumerate(views):
         inside, shown = _pixels(view, xyz)
         known = colors[inside]
-        sound = ((np.minimum(shown, known) > _DARK) & (np.maximum(shown, known) < _BRIGHT)).all(axis=1)
-        if np.count_nonzero(sound) >= _FEWEST_POINTS:
-            stops.append(_GAMMA * np.median(np.log2(shown[sound] / known[sound]), axis=0))
-    return float(np.std(stops, axis=0).max()) if len(stops) >= _FEWEST_PHOTOS else None
+        coloured = ((known > _DARK) & (known < _BRIGHT)).all(axis=1)
+        sound = coloured & ((shown > _DARK) & (shown < _BRIGHT)).all(axis=1)
+        n_coloured, n_sound = int(np.count_nonzero(coloured)), int(np.count_nonzero(sound))
+        if n_sound >= _FEWEST_POINTS:
+            stops[number] = _GAMMA * np.median(np.log2(shown[sound] / known[sound]), axis=0)
+        elif n_coloured >= max(_FEWEST_POINTS, 2 * n_sound):
+            stops[number] = np.inf
+    return stops
 
 
 def unexplained_share(views: Sequence[View], points: Points) -> float:

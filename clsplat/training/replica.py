@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..device.device import Device
 from ..rendering.build import KernelBuild
 from ..rendering.frame import Frame
@@ -17,6 +20,7 @@ from .config import TrainConfig
 from .depth_smoothness import DepthSmoothness
 from .dropout import SplatDropout
 from .exposure import PhotoLoss
+from .exposure_hint import usual_exposures
 from .loss import ImageLoss, LossResult
 from .loss_check import check_loss
 from .memory_estimate import Estimate, room_for_isects, run_memory
@@ -33,6 +37,7 @@ class Replica:
     memory : the estimate of the run's memory on this device.
     first : the splats at the start. capacity : the largest number of splats.
     n_frozen : splats that do not change, the last ones (context.py).
+    usual : the photos of usual exposure (`PhotoLoss`); None finds them if exposures are learned.
 
     Attributes
     ----------
@@ -53,6 +58,7 @@ class Replica:
         first: Mapping[str, Array],
         capacity: int,
         n_frozen: int = 0,
+        usual: NDArray[np.bool_] | None = None,
     ) -> None:
         self.device, self.kernels, self.scene, self.config = device, kernels, scene, config
         max_isects = min(isect_limit(device, kernels), room_for_isects(memory, device.info))
@@ -65,7 +71,9 @@ class Replica:
         check_step(device, kernels, config.sghmc.position_optimizer)
         channels = target_channels(scene.train, config)
         self.targets = Targets(device, kernels, scene.train, target_budget(device), channels)
-        self.exposure = PhotoLoss(self.loss, self.targets, config, config.background)
+        if usual is None and config.appearance.exposure and config.appearance.exposure_rate > 0:
+            usual = usual_exposures(scene.train, scene.points)
+        self.exposure = PhotoLoss(self.loss, self.targets, config, config.background, usual)
         self.dropout = SplatDropout(config, self.splats)
         self.smoothness = DepthSmoothness(config, kernels, self.splats, scene.train, max_isects)
 
@@ -79,7 +87,8 @@ class Replica:
         same = str(self.kernels.schedule) if device.info.name == self.device.info.name else None
         kernels = kernel_build(self.config, schedule_for(device, same))
         memory = run_memory(device, kernels, self.config, self.scene.train)
-        return Replica(device, kernels, memory, self.scene, self.config, first, self.splats.capacity)
+        capacity, usual = self.splats.capacity, self.exposure.usual
+        return Replica(device, kernels, memory, self.scene, self.config, first, capacity, usual=usual)
 
     def learn(self, target: Target, background: Color, sh_degree: int, iteration: int) -> tuple[Frame, LossResult]:
         """Render a photo's view, and write the gradients of its loss into `grads`, with those of smooth depths.

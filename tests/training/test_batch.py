@@ -139,6 +139,21 @@ def test_a_run_with_exposures_goes_on_on_several_devices(scene: Scene, halves: s
     assert_same_bits(train(scene, config).splats, train(scene, config, output=tmp_path, resume=True).splats)
 
 
+def test_all_devices_know_the_dark_photos(scene: Scene, halves: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are looked for once."""
+    found, calls = np.arange(len(scene.train)) != 1, []
+    monkeypatch.setattr("clsplat.training.replica.usual_exposures", lambda *args: calls.append(args) or found)
+    batch = Trainer(scene, config_of(batch=2, device=halves, exposure=True)).batch
+    assert batch is not None
+    assert len(batch.replicas) == 2
+    for replica in batch.replicas:
+        np.testing.assert_array_equal(replica.exposure.usual, found)
+    assert len(calls) == 1
+    Trainer(scene, config_of(exposure=True, exposure_rate=0.0))
+    Trainer(scene, config_of())
+    assert len(calls) == 1, "not needed if no exposure moves"
+
+
 @pytest.mark.parametrize("optimizer", ["fused", "numpy"])
 def test_both_optimizers_take_the_mean(scene: Scene, optimizer: str) -> None:
     """One step of three photos: the rates have the factor √3."""

@@ -7,11 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from clsplat.cameras.seen import seen
 from clsplat.scenes.colmap import Points
 from clsplat.scenes.demo.scene import write_capture
 from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.config import TrainConfig
-from clsplat.training.exposure_hint import LARGE_SPREAD, exposure_hint, exposure_spread, unexplained_share
+from clsplat.training.exposure_hint import (
+    LARGE_SPREAD,
+    exposure_hint,
+    exposure_spread,
+    unexplained_share,
+    usual_exposures,
+)
 from clsplat.training.log import Progress
 from clsplat.training.run import train
 from clsplat.training.stages import StepReports
@@ -93,6 +100,41 @@ def test_a_spread_that_exposures_do_not_explain_gets_no_hint(
     assert exposure_hint(long_scene, CONFIG) is None
     monkeypatch.setattr("clsplat.training.exposure_hint.exposure_spread", lambda *_: 0.7)
     assert exposure_hint(long_scene, CONFIG) is not None
+
+
+def darkened(scene: Scene, numbers: list[int], factors: tuple[float, float, float]) -> Scene:
+    """Return the scene with a few training photos of other channels."""
+    names = [scene.train[number].name for number in numbers]
+    views = [
+        replace(view, image=(np.asarray(view.image) * factors).astype(np.uint8)) if view.name in names else view
+        for view in scene.views
+    ]
+    return replace(scene, views=views)
+
+
+@pytest.mark.parametrize("factors", [(0.25, 0.25, 0.25), (1.0, 1.0, 0.4), (0.0, 0.0, 0.0)])
+def test_a_few_dark_photos_are_not_usual(long_scene: Scene, factors: tuple[float, float, float]) -> None:
+    dark = darkened(long_scene, [2, 7, 11], factors)
+    assert np.flatnonzero(~usual_exposures(dark.train, dark.points)).tolist() == [2, 7, 11]
+    assert usual_exposures(long_scene.train, long_scene.points).all()
+    many = darkened(long_scene, [*range(0, 21, 3)], factors)
+    assert usual_exposures(many.train, many.points).all(), "too many to be exceptions: all usual"
+    none = Points(dark.points.xyz[:0], dark.points.rgb[:0], dark.points.track_length[:0])
+    assert usual_exposures(dark.train, none).all(), "usual without points"
+
+
+def test_a_few_bright_points_do_not_make_a_photo_unusual(long_scene: Scene) -> None:
+    """30 points are in a photo that is white at 12 of them: too few are left to tell its exposure."""
+    view, points = long_scene.train[3], long_scene.points
+    coloured = np.flatnonzero(((points.rgb > 20) & (points.rgb < 230)).all(axis=1))
+    found = seen(view.camera, points.xyz[coloured])
+    pixels, first = np.unique(np.stack(found.rows_and_columns), axis=1, return_index=True)
+    few = coloured[found.inside][first[:30]]
+    assert len(few) == 30
+    image = np.full_like(np.asarray(view.image), 100)
+    image[tuple(pixels[:, :12])] = 255
+    views = [replace(one, image=image) if one.name == view.name else one for one in long_scene.train]
+    assert usual_exposures(views, Points(points.xyz[few], points.rgb[few], points.track_length[few])).all()
 
 
 def test_few_photos_do_not_say_what_exposures_explain(long_scene: Scene) -> None:
