@@ -69,8 +69,10 @@ class ViewCount:
 
 def report_test_views(metrics: Evaluation | None) -> None:
     """Print how good a model is on its test views; nothing without them."""
-    if metrics is not None:
-        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
+    if metrics is None:
+        return
+    corrected = "" if metrics.corrected_psnr is None else f" ({metrics.corrected_psnr:.2f} dB colour-corrected)"
+    click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB{corrected}, SSIM {metrics.ssim:.4f}")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = ()) -> str:

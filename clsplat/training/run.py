@@ -121,8 +121,9 @@ def evaluate_test_views(splats: Splats, scene: Scene, config: TrainConfig) -> Ev
 
     Returns
     -------
-    The metrics, or None if the scene has no test views.
+    The metrics, or None if the scene has no test views. A run that learned exposures has a colour-corrected PSNR, too.
     """
-    return (
-        evaluate(Renderer(first_device(config.device)), splats, scene.test, config.background) if scene.test else None
-    )
+    if not scene.test:
+        return None
+    renderer, exposure = Renderer(first_device(config.device)), config.appearance.exposure
+    return evaluate(renderer, splats, scene.test, config.background, also_corrected=exposure)

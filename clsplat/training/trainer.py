@@ -256,10 +256,10 @@ class Trainer:
         )
 
     def _measure_test_views(self, log: RunLog) -> None:
-        it = self.iteration
+        it, exposure = self.iteration, self.config.appearance.exposure
         splats, background = self.snapshot(), self.config.background
-        self.evaluations[it] = measured = evaluate(self.renderer, splats, self.scene.test, background)
-        self.evaluation_seconds[it] = self.seconds
+        measured = evaluate(self.renderer, splats, self.scene.test, background, also_corrected=exposure)
+        self.evaluations[it], self.evaluation_seconds[it] = measured, self.seconds
         floaters = measure_floaters(self.renderer, splats, self.scene.train, background, test_psnr=measured.psnr)
         log.write(
             {

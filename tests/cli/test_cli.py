@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -138,8 +139,23 @@ def test_train_prints_where_the_model_is_and_how_good(scene: Path, tmp_path: Pat
     result = run("train", "-s", scene, "-o", tmp_path / "m", "--eval", *SHORT)
     assert str(ply(tmp_path / "m")) in result.stdout
     assert "test views (2): PSNR" in result.stdout
+    assert "corrected" not in result.stdout
     assert "MB of device memory" in result.stderr
     assert f"{ITERATIONS}/{ITERATIONS} 100%" in result.stderr
+
+
+@pytest.mark.parametrize("measured", [[], ["--test-iterations", str(ITERATIONS)]], ids=["after", "during"])
+def test_train_with_exposures_prints_the_colour_corrected_psnr_too(
+    scene: Path, tmp_path: Path, measured: list[str]
+) -> None:
+    """It is that of `eval --color-correct`."""
+    printed = clsplat("train", "-s", scene, "-o", tmp_path / "m", "--eval", "--exposure", *measured, *SHORT)
+    found = re.search(r"PSNR (\d+\.\d\d) dB \((\d+\.\d\d) dB colour-corrected\), SSIM", printed)
+    assert found is not None
+    for value, options in zip(found.groups(), ([], ["--color-correct"]), strict=True):
+        clsplat("eval", tmp_path / "m", "--no-report", "--json", tmp_path / "n.json", "--overwrite", *options)
+        (numbers,) = json.loads((tmp_path / "n.json").read_text()).values()
+        assert numbers["results"]["PSNR"] == pytest.approx(float(value), abs=0.006)
 
 
 def test_train_without_eval_learns_from_all_views(scene: Path, tmp_path: Path) -> None:

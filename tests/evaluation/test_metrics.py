@@ -16,7 +16,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
 from clsplat.errors import InputError
 from clsplat.evaluation.evaluate import evaluate
-from clsplat.evaluation.metrics import PROTOCOLS, color_corrected, protocol_named, psnr, ssim
+from clsplat.evaluation.metrics import DEFAULT_PROTOCOL, PROTOCOLS, color_corrected, protocol_named, psnr, ssim
 from clsplat.scenes.scene import View
 from clsplat.splats.splats import Splats
 
@@ -157,6 +157,20 @@ def test_evaluate_returns_means_and_finite_values(devices: list[Device], make_re
     values = [found.per_view[f"{i}.png"]["PSNR"] for i in range(3)]
     assert values[0] == 100.0
     assert found.psnr == pytest.approx(np.mean(values)) != pytest.approx(np.median(values))
+    assert found.corrected_psnr is None
+
+
+def test_evaluate_also_measures_colour_corrected_renders(devices: list[Device], make_renderer: MakeRenderer) -> None:
+    """The photo is the render with half of its brightness."""
+    camera = Camera(24, 20, 20.0, 20.0, 12.0, 10.0, np.eye(4))
+    splats = Splats.from_points(np.array([[0.0, 0.0, 3.0]]), np.full((1, 3), 0.6), sh_degree=0)
+    renderer = make_renderer(devices[0])
+    photo = np.rint(127 * np.clip(renderer.render(splats, camera).color, 0, 1)).astype(np.uint8)
+    views = [View("0.png", camera, photo)]
+    found = evaluate(renderer, splats, views, also_corrected=True)
+    assert found.psnr == evaluate(renderer, splats, views).psnr
+    corrected = evaluate(renderer, splats, views, protocol=dataclasses.replace(DEFAULT_PROTOCOL, corrected=True))
+    assert found.corrected_psnr == corrected.psnr > found.psnr + 10
 
 
 def test_nothing_differs_where_nothing_counts() -> None:
