@@ -21,9 +21,18 @@ class PendingArrays(Mapping[str, NDArray[Any]]):
         self._readers = dict(readers)
 
     @classmethod
-    def of(cls, *parts: Mapping[str, NDArray[Any]]) -> PendingArrays:
-        """Return the arrays of several mappings, without reading any."""
-        return cls({name: partial(part.__getitem__, name) for part in parts for name in part})
+    def of(cls, *parts: Mapping[str, NDArray[Any]], without: str = "") -> PendingArrays:
+        """Return the arrays of several mappings, except the one with the name `without`. None is read."""
+        return cls({name: partial(part.__getitem__, name) for part in parts for name in part if name != without})
+
+    @classmethod
+    def first_of(cls, arrays: Mapping[str, NDArray[Any]], n: int) -> PendingArrays:
+        """Return the first n rows of arrays, without reading any."""
+
+        def first(name: str) -> NDArray[Any]:
+            return arrays[name][:n]
+
+        return cls({name: partial(first, name) for name in arrays})
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self._readers[name]()

@@ -7,14 +7,17 @@ import lzma
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device.pending_arrays import PendingArrays
 from ..errors import InputError, Remedy
 from ..files.atomic import atomic_writer
 from ..rendering.splat_buffers import SplatStatistics
@@ -110,17 +113,20 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:
-        """Return the checkpoint in a file.
+        """Return the checkpoint in a file. Its arrays are read from there whenever they are asked for.
+
+        Each is also read once now, which finds damaged bytes.
 
         Raises
         ------
         UnusableCheckpoint : it is damaged. InputError : it is missing, or of another version.
         """
-        arrays = _arrays(path)
-        meta = _meta(path, arrays)
+        headers = _headers(path)
+        meta = _meta(path, _arrays(path, "meta"))
 
-        def part(prefix: str) -> dict[str, Any]:
-            return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+        def part(prefix: str) -> PendingArrays:
+            names = [name for name in headers if name.startswith(prefix)]
+            return PendingArrays({name.removeprefix(prefix): partial(_array, path, name) for name in names})
 
         try:
             checkpoint = cls(
@@ -133,12 +139,12 @@ class Checkpoint:
                 meta["seconds"],
                 meta["schedule"],
                 meta["n_first"],
-                arrays[_STATISTICS],
+                _array(path, _STATISTICS),
                 Reached(**meta["reached"]) if meta.get("reached") else None,
                 part("average."),
                 meta.get("left_out", []),
             )
-            checkpoint._check()
+            checkpoint._check(headers)
         except _DAMAGE as error:
             raise _unreadable(path, str(error)) from None
         return checkpoint
@@ -152,11 +158,15 @@ class Checkpoint:
         except (*_DAMAGE, InputError) as error:
             raise _unreadable(path, str(error)) from None
 
-    def _check(self) -> None:
+    def _check(self, headers: Mapping[str, _Header]) -> None:
         """Raise one of _DAMAGE if `save` cannot have written a value.
 
         The zip's checksums find damaged bytes. This check finds files of other programs.
         """
+
+        def shapes(prefix: str) -> dict[str, tuple[int, ...]]:
+            return {k.removeprefix(prefix): header.shape for k, header in headers.items() if k.startswith(prefix)}
+
         for name, kind in _KINDS.items():
             value = getattr(self, name)
             if not isinstance(value, kind) or isinstance(value, bool):
@@ -171,22 +181,20 @@ class Checkpoint:
             if not all(type(place) is int and place >= 0 for place in places):
                 raise ValueError(f"its {name} is not a list of views")
         np.random.default_rng().bit_generator.state = self.rng
-        n = len(self.splats["mean"])
-        for group in (self.splats, self.optimizer, self.average, {_STATISTICS: self.statistics}):
-            if not all(values.dtype.kind in "fiu" and values.ndim for values in group.values()):
-                raise ValueError("it holds something that is not an array of numbers")
+        if not all(header.kind in "fiu" and header.shape for name, header in headers.items() if name != "meta"):
+            raise ValueError("it holds something that is not an array of numbers")
+        splats, average = shapes("splats."), shapes("average.")
+        n = splats["mean"][0]
         expected = (SplatStatistics.ROWS, n)
-        if any(len(values) != n for values in self.splats.values()) or self.statistics.shape != expected:
+        if any(shape[0] != n for shape in splats.values()) or self.statistics.shape != expected:
             raise ValueError("its arrays are not of the same splats")
-        if self.average:
-            counts = {len(values) for name, values in self.average.items() if name != "count"}
-            shapes = {name: values.shape[1:] for name, values in self.average.items() if name != "count"}
-            if shapes != {name: values.shape[1:] for name, values in self.splats.items()} or max(counts) > n:
-                raise ValueError("its average is not of the same splats")
-            if len(counts) > 1:
-                raise ValueError("its averages are not of the same splats")
-            if self.average["count"].shape != (1,) or self.average["count"][0] < 1:
+        if average:
+            if average.pop("count") != (1,) or self.average["count"][0] < 1:
                 raise ValueError("its average has no count")
+            counts = {shape[0] for shape in average.values()}
+            fields = {name: shape[1:] for name, shape in splats.items()}
+            if {name: shape[1:] for name, shape in average.items()} != fields or len(counts) > 1 or max(counts) > n:
+                raise ValueError("its average is not of the same splats")
 
 
 _STATISTICS = "signals"  # key in the file, as in the first versions
@@ -214,11 +222,39 @@ _DAMAGE = (
 )
 
 
+class _Header(NamedTuple):
+    """Shape and kind (`numpy.dtype.kind`) of an array in a file."""
+
+    shape: tuple[int, ...]
+    kind: str
+
+
+def _headers(path: Path) -> dict[str, _Header]:
+    """Read each array of a file once, and return their headers by name. It raises what `Checkpoint.load` raises."""
+
+    def header(array: NDArray[Any]) -> _Header:
+        return _Header(array.shape, array.dtype.kind)
+
+    with _opened(path) as stored:
+        return {name: header(stored[name]) for name in stored.files}
+
+
 def _arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
-    """Return arrays of a file of checkpoints, by default all. It raises what `Checkpoint.load` raises."""
+    """Return arrays of a file of checkpoints by name. It raises what `Checkpoint.load` raises."""
+    with _opened(path) as stored:
+        return {name: stored[name] for name in names}
+
+
+def _array(path: Path, name: str) -> NDArray[Any]:
+    return _arrays(path, name)[name]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Yield the archive in a file. Raise what `Checkpoint.load` raises if it cannot be opened or read."""
     try:
         with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in names or stored.files}
+            yield stored
     except FileNotFoundError:
         raise InputError(f"{path}: no checkpoint to resume from: start without --resume") from None
     except _DAMAGE as error:

@@ -11,6 +11,7 @@ Runs without exposures, masks and transparency launch none of these kernels.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from .loss import ImageLoss, LossResult
 from .programs import EXPOSURE_GROUP, EXPOSURE_SUMS, EXPOSURE_VECS, exposure_program
 from .targets import Target, Targets
 
-_KEY = "exposure"  # key of the optimizer state in a checkpoint
+KEY = "exposure"  # key of the optimizer state in a checkpoint
 _IDENTITY = np.eye(3, 4)
 
 
@@ -163,18 +164,18 @@ class PhotoLoss:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return the state for a checkpoint."""
-        return {_KEY: self._download()} if self.learns else {}
+        return {KEY: self._download()} if self.learns else {}
 
-    def load_state(self, state: dict[str, NDArray[Any]]) -> None:
-        """Continue from the exposures in `state`, and remove them from it.
+    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from the exposures in `state`, which may have others.
 
         Raises
         ------
         InputError : the exposures are missing, or belong to another number of photos.
         """
-        rows = state.pop(_KEY, None)
         if not self.learns:
             return
+        rows = state.get(KEY)
         if rows is None or rows.shape != self._rows.shape:
             raise InputError(
                 f"checkpoint: the exposures of {len(self._rows)} photos are missing: start with --overwrite"

@@ -34,6 +34,7 @@ from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
 from .context import check_context
 from .density.control import DensityControl, ExplorationNoise
+from .exposure import KEY as EXPOSURE
 from .exposure_file import exposures_json
 from .extension import reached_by
 from .folder import ModelFolder
@@ -169,11 +170,10 @@ class Trainer:
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, self.scene.extent)
 
     def _load_state(self, checkpoint: Checkpoint) -> None:
-        state = dict(checkpoint.optimizer)
-        self.exposure.load_state(state)
+        self.exposure.load_state(checkpoint.optimizer)
         for replica in self.batch.replicas[1:] if self.batch is not None else ():
             replica.exposure.follow(self.exposure)
-        self.optimizer.load_state(state)
+        self.optimizer.load_state(PendingArrays.of(checkpoint.optimizer, without=EXPOSURE))
         self.pipeline.statistics.write(checkpoint.statistics, self.splats.capacity)
 
     def run(self, folder: ModelFolder | None = None, visit: Visit | None = None) -> Model:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import tracemalloc
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -145,3 +146,51 @@ def test_json_that_is_no_object(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("[1]")
     with pytest.raises(InputError, match="expected a JSON object"):
         read_object(tmp_path / "a.json")
+
+
+def test_a_checkpoint_is_not_held_in_memory(tmp_path: Path) -> None:
+    """Its arrays are read one at a time: otherwise it would double the memory of a run that goes on."""
+    make_checkpoint(tmp_path)
+    path = tmp_path / "checkpoint.npz"
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    n, many = len(arrays["splats.mean"]), 20_000
+    for name, array in arrays.items():
+        if name.startswith(("splats.", "optimizer.")) and len(array) == n:
+            arrays[name] = np.resize(array, (many, *array.shape[1:]))
+    arrays["signals"] = np.resize(arrays["signals"], (len(arrays["signals"]), many))
+    np.savez(path, **arrays)
+    tracemalloc.start()
+    try:
+        loaded = Checkpoint.load(path)
+        taken = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert taken < path.stat().st_size / 3
+    for name, array in loaded.splats.items():
+        np.testing.assert_array_equal(array, arrays[f"splats.{name}"])
+
+
+@pytest.mark.parametrize("damage", ["one shorter", "longer", "other fields", "no count", "count of 0"])
+def test_a_damaged_average_is_found(tmp_path: Path, damage: str) -> None:
+    make_checkpoint(tmp_path)
+    path = tmp_path / "checkpoint.npz"
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    mean = {name.replace("splats.", "average."): array for name, array in arrays.items() if name.startswith("splats.")}
+    mean["average.count"] = np.array([2])
+    np.savez(path, **arrays, **mean)
+    assert Checkpoint.load(path).average["count"] == [2]
+    if damage == "one shorter":
+        mean["average.mean"] = mean["average.mean"][1:]
+    elif damage == "longer":
+        mean = {name: array if name == "average.count" else np.repeat(array, 2, axis=0) for name, array in mean.items()}
+    elif damage == "other fields":
+        del mean["average.quat"]
+    elif damage == "no count":
+        del mean["average.count"]
+    else:
+        mean["average.count"] = np.array([0])
+    np.savez(path, **arrays, **mean)
+    with pytest.raises(InputError, match="not a readable checkpoint"):
+        Checkpoint.load(path)

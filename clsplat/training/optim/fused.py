@@ -164,7 +164,8 @@ class FusedOptimizer:
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         if self.splats.n_frozen:  # earlier versions had a state of frozen splats, which was zero
-            state = {name: rows if name == "steps" else rows[: self.splats.n_live] for name, rows in state.items()}
+            rows = PendingArrays.first_of(PendingArrays.of(state, without="steps"), self.splats.n_live)
+            state = PendingArrays.of(rows, {"steps": state["steps"]})
         check_state(state, self.state())
         self.steps = int(state["steps"][0])
         self.moments.load_state(state, self._base_names)

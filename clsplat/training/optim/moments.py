@@ -74,12 +74,12 @@ class AdamMoments:
 
     def load_state(self, state: Mapping[str, NDArray[Any]], names: Iterable[str]) -> None:
         """Continue from moments by name."""
-        first = {name: state[f"first.{name}"] for name in names}
-        second = {name: state[f"second.{name}"] for name in first}
-        if self.half:
-            first["sh"] = packed(first["sh"], second.pop("sh")).view(np.float32)
-        self.first.upload(first)
-        self.second.upload(second)
+        for name in names:  # one at a time: the state may be in a file
+            if self.half and name == "sh":
+                self.first.upload({name: packed(state["first.sh"], state["second.sh"]).view(np.float32)})
+            else:
+                self.first.upload({name: state[f"first.{name}"]})
+                self.second.upload({name: state[f"second.{name}"]})
 
     def reset(self, n: int, names: Iterable[str]) -> None:
         """Set the moments of some fields of n splats to zero."""
