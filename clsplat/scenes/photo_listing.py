@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from ..errors import InputError
@@ -16,6 +17,8 @@ from ..files.masks import BESIDE, MASK_FOLDER
 from .colmap_folder import colmap_folder, models_in
 from .reconstruct.options import RECORD
 from .scene_files import find_scene_files
+
+_MAX_FOLDERS = 2000  # largest number of folders to look into for a first photo
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,50 @@ def list_images(home: Path, suffixes: Collection[str]) -> Listing:
     contents, not by their names. Renders are left out beside photos; a folder with nothing else is taken as it is.
     A warning counts the folders that this user may not read.
     """
-    names: list[str] = []
     outputs: list[str] = []
     scenes: list[str] = []
     closed: list[OSError] = []
+    names = [name for some in _names_by_folder(home, suffixes, outputs, scenes, closed) for name in some]
+    _warn_of_closed(home, closed)
+    known = {part for name in names for part in (name, bare_name(name))}
+    names = [name for name in names if not (name.lower().endswith(BESIDE) and name[: -len(BESIDE)] in known)]
+    photos = [name for name in names if not (name.lower().endswith(".png") and is_render(home / name))]
+    renders = len(names) - len(photos)
+    if photos and renders:
+        outputs.append(f"{renders} render{'s' if renders > 1 else ''}")
+        names = photos
+    return Listing(tuple(sorted(names)), tuple(outputs), tuple(scenes))
+
+
+def has_images(home: Path, suffixes: Collection[str]) -> bool:
+    """Return whether `list_images` finds a file. The first one ends the search, and so do 2000 folders without any.
+
+    A disk has many more folders than that. Whoever names all of it does not mean its photos.
+    """
+    closed: list[OSError] = []
+    folders = _names_by_folder(home, suffixes, [], [], closed)
+    if any(islice(folders, _MAX_FOLDERS)):
+        return True
+    _warn_of_closed(home, closed)
+    return False
+
+
+def _names_by_folder(
+    home: Path, suffixes: Collection[str], outputs: list[str], scenes: list[str], closed: list[OSError]
+) -> Iterator[list[str]]:
+    """Yield the names of the files in each folder that is not left out, also masks and renders.
+
+    Parameters
+    ----------
+    outputs, scenes : get the folders that are left out, as of `Listing`. closed : gets what cannot be read.
+    """
     for folder, folders, files in os.walk(home, onerror=closed.append):
         below = Path(folder).relative_to(home)
+        yield [
+            (below / name).as_posix()
+            for name in files
+            if not name.startswith(".") and Path(name).suffix.lower() in suffixes
+        ]
         kept = []
         for name in sorted(folders):
             path, shown = Path(folder) / name, (below / name).as_posix()
@@ -68,20 +109,6 @@ def list_images(home: Path, suffixes: Collection[str]) -> Listing:
             except PermissionError as error:
                 closed.append(PermissionError(error.errno, error.strerror, str(path)))
         folders[:] = kept
-        names += [
-            (below / name).as_posix()
-            for name in files
-            if not name.startswith(".") and Path(name).suffix.lower() in suffixes
-        ]
-    _warn_of_closed(home, closed)
-    known = {part for name in names for part in (name, bare_name(name))}
-    names = [name for name in names if not (name.lower().endswith(BESIDE) and name[: -len(BESIDE)] in known)]
-    photos = [name for name in names if not (name.lower().endswith(".png") and is_render(home / name))]
-    renders = len(names) - len(photos)
-    if photos and renders:
-        outputs.append(f"{renders} render{'s' if renders > 1 else ''}")
-        names = photos
-    return Listing(tuple(sorted(names)), tuple(outputs), tuple(scenes))
 
 
 def _warn_of_closed(home: Path, errors: Collection[OSError]) -> None:

@@ -15,8 +15,8 @@ from clsplat.errors import InputError
 from clsplat.files.image_names import IMAGE_SUFFIXES
 from clsplat.files.images import is_render, write_grey16, write_png
 from clsplat.scenes import photo_listing, wrong_folder
-from clsplat.scenes.photo_listing import is_posed, list_images
-from clsplat.scenes.reconstruct.photo_files import find_photos, fingerprint, left_out_below
+from clsplat.scenes.photo_listing import has_images, is_posed, list_images
+from clsplat.scenes.reconstruct.photo_files import find_photos, fingerprint, is_photographs, left_out_below
 
 PIXELS = np.arange(8 * 6 * 3, dtype=np.uint8).reshape(6, 8, 3)
 
@@ -129,3 +129,38 @@ def test_folders_that_cannot_be_read_are_left_out_with_one_warning(
     assert len(told) == 1
     assert str(photos / "closed:") in str(told[0].message)
     assert wrong_folder.scenes_below(photos) == []
+
+
+def test_the_first_photo_ends_the_search_for_one(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether a folder has photos does not depend on what else is in it."""
+    looked: list[str] = []
+
+    def looked_at(path: Path) -> bool:
+        looked.append(path.name)
+        return is_posed(path)
+
+    monkeypatch.setattr(photo_listing, "is_posed", looked_at)
+    assert is_photographs(photos)
+    assert looked == []
+    assert has_images(photos.parent, IMAGE_SUFFIXES)
+    assert looked == ["photos"]
+
+
+def test_the_search_for_a_photo_ends_after_many_folders(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looking through a whole disk would take long."""
+    for number in range(3):
+        (photos.parent / "disk" / str(number) / "etc").mkdir(parents=True)
+    photos.rename(photos.parent / "disk" / "photos")
+    monkeypatch.setattr(photo_listing, "_MAX_FOLDERS", 8)
+    assert has_images(photos.parent, IMAGE_SUFFIXES) is False
+    monkeypatch.setattr(photo_listing, "_MAX_FOLDERS", 9)
+    assert has_images(photos.parent, IMAGE_SUFFIXES) is True
+
+
+def test_masks_and_renders_alone_are_found_as_they_are_listed(photos: Path) -> None:
+    write_png(photos / "m" / "a.mask.png", PIXELS)
+    write_png(photos / "r" / "0.png", PIXELS, render=True)
+    (photos / "e").mkdir()
+    for name in ("m", "r", "e"):
+        folder = photos / name
+        assert has_images(folder, IMAGE_SUFFIXES) == bool(list_images(folder, IMAGE_SUFFIXES).names) == (name != "e")

@@ -27,7 +27,7 @@ from ...files.images import (
 from ...files.masks import MASK_FOLDER, Mask, mask_files, masks_beside, read_mask, resize_mask, warn_of_unused
 from ...files.real_path import real_path
 from ..colmap_folder import colmap_folder
-from ..photo_listing import Listing, list_images
+from ..photo_listing import Listing, has_images, list_images
 from ..scene_files import find_scene_files
 from ..wrong_folder import describe_scenes, scene_hint
 
@@ -88,7 +88,7 @@ def is_photographs(path: Path) -> bool:
     if not path.is_dir():
         return is_video(path)
     posed = colmap_folder(path) is not None or any(path.glob("transforms*.json")) or bool(find_scene_files(path))
-    return not posed and bool(list_images(_photo_folder(path), {*IMAGE_SUFFIXES, *CONVERTERS}).names)
+    return not posed and has_images(_photo_folder(path), {*IMAGE_SUFFIXES, *CONVERTERS})
 
 
 def find_photos(path: Path) -> list[PhotoFile]:
@@ -253,7 +253,7 @@ def group_by_camera(photos: Sequence[StagedPhoto], mode: str) -> list[list[Stage
 def _photo_folder(path: Path) -> Path:
     """Return the first folder of _PHOTO_FOLDERS inside a folder that has photos, or else the folder itself."""
     for images in (path / name for name in _PHOTO_FOLDERS):
-        if images.is_dir() and list_images(images, IMAGE_SUFFIXES).names:
+        if images.is_dir() and has_images(images, IMAGE_SUFFIXES):
             return images
     return path
 
