@@ -22,7 +22,9 @@ def with_photos(scene: Scene, config: TrainConfig) -> Scene:
     InputError : a photo cannot be used, or transparent photos lie over another background than that of the run.
     """
     if config.cut_background:
-        scene = with_cut_outs(scene, config.background)
+        photos, scene = scene.train, with_cut_outs(scene, config.background)
+        for view in photos:  # its cut-out has the pixels, and gives them up when the device has them
+            view.release()
     keep_photos(scene.train)
     if not config.cut_background and tuple(scene.background) != tuple(config.background):
         _check_background(scene, config.background)

@@ -15,7 +15,9 @@ from ..errors import InputError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..files.json_file import describe_any
 from ..rendering.renderer import Renderer
+from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene
+from ..scenes.split import split_for_run
 from ..splats.fields import Group
 from ..splats.splats import Splats
 from .config import TrainConfig
@@ -79,6 +81,8 @@ def train(
     folder = None if output is None else ModelFolder(output)
     with nullcontext() if folder is None else folder.for_run(resume=resume, overwrite=overwrite):
         checkpoint = None
+        # Photos are decoded once, before the checks and hints. Each of these would decode many of them for itself.
+        keep_photos(split_for_run(scene, config.validation.validate).train)
         scene = with_fitting_points(scene)  # also to go on: the extent of the scene depends on the points
         if folder is not None and resume:
             checkpoint = fitting_checkpoint(folder, config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,10 @@ import numpy as np
 import pytest
 
 from clsplat.errors import InputError
-from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.read_view import PhotoReader
+from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.scenes.split import split_for_run
+from clsplat.scenes.view import StoredView
 from clsplat.training.config import TrainConfig
 from clsplat.training.photos import with_photos
 from clsplat.training.run import train
@@ -37,3 +41,52 @@ def test_transparent_photos_must_lie_over_the_background_of_the_run(scene: Scene
     assert with_photos(over_white, config).background == WHITE
     for opaque in (scene, with_opacity(scene, 255)):
         assert with_photos(opaque, config).train
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the photos in the order in which they are decoded."""
+    names: list[str] = []
+    read = PhotoReader.read
+
+    def counted(self: PhotoReader) -> View | str:
+        names.append(self.photo.name)
+        return read(self)
+
+    monkeypatch.setattr(PhotoReader, "read", counted)
+    return names
+
+
+def test_a_run_decodes_each_of_its_photos_once(capture_folder: Path, decoded: list[str]) -> None:
+    """The check of the points, the decisions and the hints look at the same photos."""
+    scene = load_scene(capture_folder, read_photos=False)
+    assert not decoded
+    said: list[str] = []
+    config = TrainConfig(iterations=2, cap_max=50, device="cpu")
+    train(scene, config, lambda progress: said.append(progress.message))
+    assert any(message.startswith("decided") for message in said)
+    assert Counter(decoded) == Counter(view.name for view in scene.train)
+
+
+def test_validation_photos_are_not_kept(capture_folder: Path) -> None:
+    """Some of them are looked at before the run, and all are measured in it."""
+    scene = load_scene(capture_folder, read_photos=False)
+    held: list[str] = []
+
+    def look(trainer: object, stop: object) -> None:
+        held.extend(view.name for view in scene.views if isinstance(view, StoredView) and view.is_kept)
+
+    config = TrainConfig(iterations=1, cap_max=50, validate=True)
+    train(scene, config, visit=look)
+    assert held
+    assert not {view.name for view in split_for_run(scene, True).validation} & set(held)
+
+
+def test_photos_before_a_plain_background_are_in_memory_once(capture_folder: Path) -> None:
+    """The cut-out of a photo has its pixels. A photo that stays beside it would keep them when the device has them."""
+    scene = load_scene(capture_folder)
+    views = scene.train
+    assert all(isinstance(view, StoredView) and view.is_kept for view in views)
+    found = with_photos(scene, TrainConfig(cut_background=True, background=WHITE))
+    assert not any(isinstance(view, StoredView) and view.is_kept for view in views)
+    assert all(isinstance(view, StoredView) and view.is_kept for view in found.train)
