@@ -37,6 +37,7 @@ from ..training.decisions import as_decided, decide
 from ..training.exposure_file import copy_exposures, exposures_beside
 from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
+from ..training.point_fit import with_fitting_points
 from ..training.run import train
 from ..training.stages import StepReports
 from ..training.stored_run import holds_run
@@ -109,7 +110,8 @@ def train_budget(
             state.load()
             config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
             state.check(config, options)
-        else:
+        scene = with_fitting_points(with_small_photos_in_memory(scene))
+        if not resume:
             config = decide(scene, config).tell(progress)
             folder.clear()
             state.begin(config, options, scene_record(scene, folder.path))
@@ -130,7 +132,7 @@ class _Search:
         cluster: str | None = None,
     ) -> None:
         self.cluster = cluster
-        self.scene, self.options = with_small_photos_in_memory(scene), options
+        self.scene, self.options = scene, options
         self.state, self.folder = state, folder
         self.split = hold_out(self.scene)
         self.renderer = Renderer(config.device)

@@ -64,6 +64,7 @@ class Scene:
     photo_files : files of the photos and their masks.
     validation_names : names of the views held out to choose between models; they are no training views.
     origin : the point of the files' coordinates that is the origin of cameras and points (`load_scene`).
+    points_fit : whether a run has found that the points fit the photos (training/point_fit.py), or has left them out.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Scene:
     photo_files: Sequence[Path] = ()
     validation_names: frozenset[str] = frozenset()
     origin: tuple[float, float, float] = ORIGIN
+    points_fit: bool = False
 
     @property
     def cameras(self) -> list[Camera]:

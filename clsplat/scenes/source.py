@@ -28,6 +28,7 @@ class SceneSource:
     names : names of all views.
     photo_digests : as of `Scene`.
     points_digest : digest of the points; None without points, which may be in the files but do not fit the poses.
+    points_fit : as of `Scene`. The program that asks has looked at the photos, so that no other program has to.
     """
 
     name: str
@@ -39,6 +40,7 @@ class SceneSource:
     validation_names: frozenset[str]
     photo_digests: Mapping[str, str]
     points_digest: str | None
+    points_fit: bool
 
     @classmethod
     def of(cls, scene: Scene) -> SceneSource:
@@ -54,6 +56,7 @@ class SceneSource:
             scene.validation_names,
             dict(scene.photo_digests),
             _points_digest(scene),
+            scene.points_fit,
         )
 
     def load(self, read_photos: bool = True) -> Scene:
@@ -83,7 +86,7 @@ class SceneSource:
                 f"{self.path}: the points are others here than in the program that asks: copy the scene's files again, "
                 "and do not change a scene between reading and training"
             )
-        return self.part_of(loaded)
+        return self.part_of(replace(loaded, points_fit=self.points_fit))
 
     def of_views(self, names: Sequence[str]) -> SceneSource:
         """Return the source of a scene with some of the views, all for training."""

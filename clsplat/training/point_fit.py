@@ -38,19 +38,23 @@ _FLOOR = 10.0  # added to brightness 0..255 before its logarithm, so that noise 
 def with_fitting_points(scene: Scene) -> Scene:
     """Return the scene, or without its points if they do not fit its training photos.
 
+    The result says so (`Scene.points_fit`), and is not looked at again.
+
     Warns
     -----
     UserWarning : the points are left out.
     """
+    if scene.points_fit:
+        return scene
     fit = point_fit(scene.train, scene.points)
     if fit is None or fit[0] >= _LEAST_CORRELATION or fit[1] >= _LEAST_AGREEMENT:
-        return scene
+        return replace(scene, points_fit=True)
     warnings.warn(
         f"{scene.path}: the photos do not show the colours of its {len(scene.points)} points where these lie, so the "
         "points do not fit the poses; they are left out: check that both have one coordinate system",
         stacklevel=3,
     )
-    return replace(scene, points=NO_POINTS)
+    return replace(scene, points=NO_POINTS, points_fit=True)
 
 
 def point_fit(views: Sequence[View], points: Points) -> tuple[float, float] | None:

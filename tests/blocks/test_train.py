@@ -22,6 +22,7 @@ from clsplat.blocks.partition import Partition, make_partition, surroundings
 from clsplat.blocks.state import BlocksOptions, BlocksState
 from clsplat.blocks.targets import BlockTargets
 from clsplat.blocks.train import PICTURE, BlocksModel, partition_scene, train_in_blocks
+from clsplat.compression.rules import BudgetOptions
 from clsplat.compression.search import train_budget
 from clsplat.errors import ClsplatError, InputError, OutputError
 from clsplat.models.resume import resume
@@ -128,6 +129,24 @@ def test_points_that_do_not_fit_the_photos_are_in_no_block(scene: Scene, tmp_pat
         found = partition_scene(with_points_elsewhere(scene), TWO, CONFIG, output=tmp_path)
     assert len(warned) == 1
     assert not any(block.points for block in found.blocks)
+
+
+@pytest.mark.parametrize("kind", ["blocks", "budget"])
+def test_points_are_looked_at_once_for_all_runs(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """What a block learns is not what the photos show, so points that fit could be left out."""
+    looked: list[int] = []
+
+    def fit(views: object, points: object) -> None:
+        looked.append(1)
+
+    monkeypatch.setattr("clsplat.training.point_fit.point_fit", fit)
+    if kind == "blocks":
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
+    else:
+        train_budget(scene, CONFIG, BudgetOptions(1.0), output=tmp_path)
+    assert len(looked) == 1
 
 
 def test_the_model_has_all_splats_of_all_blocks(finished: BlocksModel, scene: Scene) -> None:

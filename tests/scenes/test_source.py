@@ -45,6 +45,11 @@ def test_the_scene_comes_back(folder: Path, reading: dict) -> None:
     assert (found.points.xyz == scene.points.xyz).all()
 
 
+@pytest.mark.parametrize("points_fit", [False, True])
+def test_points_are_looked_at_by_one_program(folder: Path, points_fit: bool) -> None:
+    assert again(replace(load_scene(folder), points_fit=points_fit)).points_fit == points_fit
+
+
 @pytest.mark.parametrize("change", [hold_out, with_validation])
 def test_views_that_are_held_out_stay_so(folder: Path, change) -> None:
     scene = change(load_scene(folder))

@@ -13,7 +13,7 @@ import pytest
 from small_scene import with_points_elsewhere
 
 from clsplat.cameras.seen import seen
-from clsplat.scenes.colmap import NO_POINTS
+from clsplat.scenes.colmap import NO_POINTS, Points
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.config import TrainConfig
 from clsplat.training.log import Progress
@@ -30,7 +30,10 @@ def random_colors(scene: Scene) -> Scene:
 def test_points_that_fit_are_kept(scene: Scene) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert with_fitting_points(scene) is scene
+        found = with_fitting_points(scene)
+    assert found.points is scene.points
+    assert found.points_fit
+    assert not scene.points_fit
 
 
 def test_points_elsewhere_are_left_out_with_a_warning(scene: Scene) -> None:
@@ -43,18 +46,34 @@ def test_points_elsewhere_are_left_out_with_a_warning(scene: Scene) -> None:
     assert found.views is wrong.views
 
 
+def test_a_scene_is_looked_at_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if the points are left out."""
+    looked: list[int] = []
+
+    def fit(views: object, points: Points) -> tuple[float, float]:
+        looked.append(len(points))
+        return 0.0, 0.0
+
+    monkeypatch.setattr("clsplat.training.point_fit.point_fit", fit)
+    with pytest.warns(UserWarning, match="they are left out") as warned:
+        found = with_fitting_points(scene)
+    assert with_fitting_points(found) is found
+    assert looked == [len(scene.points)]
+    assert len(warned) == 1
+
+
 @pytest.mark.parametrize("change", ["random", "one colour"])
 def test_colours_alone_are_no_reason(scene: Scene, change: str) -> None:
     """Points have colours of their own in some programs. The photos agree where such points lie."""
     grey = replace(scene, points=replace(scene.points, rgb=np.full_like(scene.points.rgb, 90)))
     changed = random_colors(scene) if change == "random" else grey
-    assert with_fitting_points(changed) is changed
+    assert with_fitting_points(changed).points is changed.points
 
 
 @pytest.mark.parametrize("fit", [(0.3, 0.0), (0.0, 0.3), None])
 def test_one_sign_is_enough(scene: Scene, monkeypatch: pytest.MonkeyPatch, fit: tuple[float, float] | None) -> None:
     monkeypatch.setattr("clsplat.training.point_fit.point_fit", lambda views, points: fit)
-    assert with_fitting_points(scene) is scene
+    assert with_fitting_points(scene).points is scene.points
 
 
 def test_points_in_other_rooms_do_not_count(scene: Scene) -> None:
@@ -68,7 +87,7 @@ def test_points_in_other_rooms_do_not_count(scene: Scene) -> None:
     fit = point_fit(scene.train, building.points)
     assert fit is not None
     assert fit[0] > 0.45
-    assert with_fitting_points(building) is building
+    assert with_fitting_points(building).points is building.points
 
 
 def test_both_numbers_are_those_of_a_loop(scene: Scene) -> None:
