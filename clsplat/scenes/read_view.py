@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.host_memory import give_back_free_memory
 from ..files.images import ImageU8, is_whole, read_image, resize_area
-from ..files.masks import read_mask, resize_mask
+from ..files.masks import Mask, read_mask, resize_mask
 from ..splats.color import Color
 from .bars import NO_BARS, Bars
 from .photo_size import target_size
@@ -89,8 +89,12 @@ class PhotoReader:
         camera = self.photo.fitted_camera(*self.size)
         return camera.resized(*target_size(camera.width, camera.height, self.resolution))
 
-    def read(self) -> View | str:
+    def read(self, look: Callable[[ImageU8], None] | None = None) -> View | str:
         """Return the view, or the reason why the photo cannot be used.
+
+        Parameters
+        ----------
+        look : called with the pixels as they are stored (`read_image`), for whoever needs both and decodes once.
 
         Raises
         ------
@@ -104,6 +108,8 @@ class PhotoReader:
             )
         except InputError as error:
             return str(error)
+        if look is not None:
+            look(stored)
         width, height = self.size
         masks = [] if self.mask_file is None else [read_mask(self.mask_file)]
         if any(self.bars):
@@ -118,8 +124,7 @@ class PhotoReader:
                 stored = _composited(stored, self.background)
         image = self._fitted(np.ascontiguousarray(stored), size)
         del stored
-        fitted = [self.photo.fit_mask(each, width, height) for each in masks]
-        mask = resize_mask(np.logical_and.reduce(fitted), *size) if fitted else None
+        mask = self._fitted_mask(masks, size) if masks else None
         view = View(
             self.photo.name,
             camera,
@@ -133,6 +138,16 @@ class PhotoReader:
             return f"{self.file}: its mask hides every pixel"
         return replace(view, mask=None) if mask.all() else view
 
+    def opaque_part(self, stored: ImageU8) -> Mask:
+        """Return which pixels of the view are at least half opaque. stored : (H, W, 4), as of `read`."""
+        camera = self.camera()
+        return self._fitted_mask([stored[:, :, 3] >= _OPAQUE], (camera.width, camera.height))
+
+    def _fitted_mask(self, masks: Sequence[Mask], size: tuple[int, int]) -> Mask:
+        """Return which pixels of the view all masks of the photo keep."""
+        fitted = [self.photo.fit_mask(each, *self.size) for each in masks]
+        return resize_mask(np.logical_and.reduce(fitted), *size)
+
     def _fitted(self, stored: ImageU8, size: tuple[int, int]) -> ImageU8:
         """Return opaque pixels, as stored or reduced already, at the size of the view and without distortion."""
         if is_pinhole(self.photo.lens):
@@ -140,29 +155,32 @@ class PhotoReader:
         image, camera = self.photo.fit(stored)
         return image if (camera.width, camera.height) == size else resize_area(image, *size)
 
-    def view(self) -> View:
-        """Return the view; raise InputError if the photo cannot be used."""
-        found = self.read()
+    def view(self, look: Callable[[ImageU8], None] | None = None) -> View:
+        """Return the view; raise InputError if the photo cannot be used. look : as of `read`."""
+        found = self.read(look)
         if isinstance(found, str):
             raise InputError(found)
         return found
 
 
-def read_views(readers: Sequence[PhotoReader], now: Sequence[bool]) -> list[View | str]:
+def read_views(
+    readers: Sequence[PhotoReader], now: Sequence[bool], decoded: Mapping[str, View] | None = None
+) -> list[View | str]:
     """Return the view of each photo, or the reason why it cannot be used.
 
     Parameters
     ----------
     now : whether to decode each photo now and keep it. Other photos become a `StoredView`. They are decoded once to
         check them only if their files do not end as they should, or if their masks may hide everything.
+    decoded : views by name that were read before, of photos without masks.
     """
-    numbers, n = itertools.count(1), sum(now)
+    numbers, n, known = itertools.count(1), sum(now), decoded or {}
 
     def one(reader: PhotoReader, keep: bool) -> View | str:
         if keep:
             activity.report(f"reading photo {next(numbers)} of {n}")
-        view = None
-        if keep or reader.may_hide_pixels or not is_whole(reader.file):
+        view = known.get(reader.photo.name) if keep and not reader.may_hide_pixels else None
+        if view is None and (keep or reader.may_hide_pixels or not is_whole(reader.file)):
             found = reader.read()
             if isinstance(found, str):
                 return found

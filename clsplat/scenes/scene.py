@@ -191,8 +191,10 @@ def load_scene(
     decoded = [read_photos and photo.name not in test_names for photo in photos]
     sizes = [posed.sizes[photo.name] for photo, now in zip(photos, decoded, strict=True) if now]
     check_memory(root, sizes, resolution)
+    known: Mapping[str, View] = {}
     if alpha is None:
-        alpha = use_of_alpha(root, posed, resolution, background)
+        kept = {photo.name for photo, now in zip(photos, decoded, strict=True) if now} - mask_of.keys()
+        alpha, known = use_of_alpha(root, posed, resolution, background, kept)
     if masks == NO_MASKS:
         bars = NO_BARS
     bars = bars_of(root, posed, mask_of) if bars is None else checked_bars(bars)
@@ -209,7 +211,7 @@ def load_scene(
         )
         for photo in photos
     ]
-    results = read_views(readers, decoded)
+    results = read_views(readers, decoded, known)
     names = [result.name for result in results if isinstance(result, View)]
     with ThreadPoolExecutor() as pool:
         digests = list(pool.map(lambda name: file_digest(*_files_of(name, posed, mask_of)), names))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -86,13 +87,13 @@ def still_pixels(views: Sequence[View]) -> tuple[Mask, bool]:
     views : of one size. Their photos are decoded one after the other. Pixels that a mask hides in any of them do not
         count.
     """
-    first = views[0].loaded()
+    photos = (view.loaded() for view in views)
+    first = next(photos)
     low, high = first.image.copy(), first.image.copy()
     counted: Mask = np.ones(low.shape[:2], np.bool_)
     empty: Mask | None = counted.copy()  # None as soon as a photo is opaque
     transparent = 0  # pixels of all photos
-    for view in views:
-        photo = view.loaded()
+    for photo in chain([first], photos):
         if photo.mask is not None:
             counted &= photo.mask
         if empty is not None and photo.alpha is not None:

@@ -6,101 +6,153 @@ Points of the scene that lie there show it.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ..cameras.seen import sampled, sampled_views, seen
 from ..errors import InputError
-from ..files.images import has_alpha
+from ..files.images import ImageU8, has_alpha
 from ..files.masks import Mask, read_mask
 from ..splats.color import Color
+from ..splats.fields import DoubleArray
 from .bars import NO_BARS, Bars, commonest_size, find_bars
 from .options import ALPHA_USES
 from .posed_images import PosedImages
 from .read_view import PhotoReader
 from .still_pixels import DENSITY, FEWEST_VIEWS, hide_points, pixels_before_scene
 from .undistort import RegisteredImage
-from .view import StoredView
+from .view import StoredView, View
 
 # Share of photos with transparent parts from which the others do not show that these are no background: an object may
 # fill the others. Without points nothing else separates the two.
 _MOST_CUT, _MOST_CUT_WITHOUT_POINTS = 0.9, 0.5
 
 
-def use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: Color) -> str:
-    """Return what the transparency of the photos means, one of ALPHA_USES, and warn if it means that data is missing.
+class AlphaUse(NamedTuple):
+    """What transparency means, one of ALPHA_USES, and the views that were read to find out, by name.
+
+    The views are composited over the background. If transparency is a mask, the mapping is empty.
+    """
+
+    use: str
+    decoded: Mapping[str, View]
+
+
+def use_of_alpha(
+    root: Path, posed: PosedImages, resolution: int, background: Color, kept: Collection[str] = ()
+) -> AlphaUse:
+    """Return what the transparency of the photos means, and warn if it means that data is missing.
 
     The photos of all views are looked at, so that a part of a scene is read as the whole.
 
     Parameters
     ----------
     root : the scene, for the warning. resolution, background : as for `load_scene`.
+    kept : names of the photos whose views are returned if they are read.
     """
-    found = None
+    found, decoded = None, dict[str, View]()
     # A photo that cannot be used is reported when all are read.
     with suppress(InputError):
         photos = [photo for photo in posed.photos if has_alpha(posed.files[photo.name])]
-        readers = [
-            PhotoReader.of(posed, photo, resolution, background, alpha_hides=True) for photo in sampled_views(photos)
-        ]
+        readers = [PhotoReader.of(posed, photo, resolution, background) for photo in sampled_views(photos)]
+        sample = _TransparentPhotos(readers, posed.points.xyz, kept, decoded)
         if len(photos) == len(posed.photos) and len(posed.points):
-            found = _rims(readers, posed)
+            found = sample.rims()
         if found is None and photos:
-            found = _cut_outs(readers, posed, len(photos))
+            found = sample.cut_outs(len(photos), len(posed.photos))
     if found is None:
-        return ALPHA_USES[0]
+        return AlphaUse(ALPHA_USES[0], decoded)
     warnings.warn(
         f'{root}: {found}: they are left out as pixels without data (alpha "mask"); with alpha "background" they are '
         "the background of an object",
         stacklevel=4,
     )
-    return ALPHA_USES[1]
+    return AlphaUse(ALPHA_USES[1], {})
 
 
-def _rims(readers: Sequence[PhotoReader], posed: PosedImages) -> str | None:
-    """Return words for pixels that are transparent in all photos where points of the scene lie; None without such."""
-    views = [
-        StoredView(reader.photo.name, reader.camera(), replace(reader, alpha_hides=False).view) for reader in readers
-    ]
-    found = pixels_before_scene(views, posed.points.xyz)
-    if found is None:
-        return None
-    return f"{found.share:.0%} of the pixels are transparent in all photos, but points of the scene lie there"
+class _Part(NamedTuple):
+    """The transparent part of a photo: its share, 0 to 1, and the points of the scene in the photo and in the part."""
+
+    share: float
+    inside: int
+    within: int
 
 
-def _cut_outs(readers: Sequence[PhotoReader], posed: PosedImages, with_alpha: int) -> str | None:
-    """Return words for transparent parts of some photos, if other photos are opaque; None without such.
-
-    Opaque photos show what is around, so transparent parts are no background of an object. But an object may fill a few
-    of its photos, and a sky may be cut out of those that show it: no points of the scene lie there.
+class _TransparentPhotos:
+    """Photos that may be transparent. A photo is decoded once for all questions.
 
     Parameters
     ----------
-    readers : of the photos that may be transparent, or of some of them. with_alpha : number of these photos.
+    readers : of the photos, over the background. xyz : points of the scene (P, 3).
+    kept : names of the photos whose views go into `decoded`.
     """
-    n, xyz = len(posed.photos), posed.points.xyz
-    per_reader = with_alpha / len(readers)
-    limit = n * (_MOST_CUT if len(xyz) else _MOST_CUT_WITHOUT_POINTS)
-    shares: list[float] = []
-    within, expected = 0, 0.0
-    for reader in readers:
-        view = reader.read()
-        if isinstance(view, str) or view.mask is None:
-            continue
-        found = seen(view.camera, sampled(xyz))
-        shares.append(1.0 - float(view.mask.mean()))
-        within += int(np.count_nonzero(~view.mask[found.rows_and_columns]))
-        expected += shares[-1] * int(np.count_nonzero(found.inside))
-        if len(shares) * per_reader >= limit:
+
+    def __init__(
+        self, readers: Sequence[PhotoReader], xyz: DoubleArray, kept: Collection[str], decoded: dict[str, View]
+    ) -> None:
+        self.xyz, self.kept, self.decoded = xyz, kept, decoded
+        self.views = [StoredView(reader.photo.name, reader.camera(), partial(self._read, reader)) for reader in readers]
+        self._parts: dict[str, _Part | None] = {}  # of the photos that were decoded; None for opaque ones
+
+    def _read(self, reader: PhotoReader) -> View:
+        view = reader.view(partial(self._look, reader))
+        if view.name in self.kept:
+            self.decoded[view.name] = view
+        return view
+
+    def _look(self, reader: PhotoReader, stored: ImageU8) -> None:
+        opaque: Mask = reader.opaque_part(stored) if stored.shape[2] == 4 else np.ones(1, np.bool_)
+        part = None
+        if opaque.any() and not opaque.all():
+            found = seen(reader.camera(), sampled(self.xyz))
+            within = np.count_nonzero(~opaque[found.rows_and_columns])
+            part = _Part(1.0 - float(opaque.mean()), int(np.count_nonzero(found.inside)), int(within))
+        self._parts[reader.photo.name] = part
+
+    def rims(self) -> str | None:
+        """Return words for pixels that are transparent in all photos where points of the scene lie, or None."""
+        found = pixels_before_scene(self.views, self.xyz)
+        if found is None:
             return None
-    if not shares or within < DENSITY * expected:
-        return None
-    number = f"{'about ' if per_reader > 1 else ''}{round(len(shares) * per_reader)} of {n}"
-    return f"{number} photos have transparent parts ({np.mean(shares):.0%} of their pixels), and the others are opaque"
+        return f"{found.share:.0%} of the pixels are transparent in all photos, but points of the scene lie there"
+
+    def cut_outs(self, with_alpha: int, n: int) -> str | None:
+        """Return words for transparent parts of some photos, if other photos are opaque; None without such.
+
+        Opaque photos show what is around, so transparent parts are no background of an object. But an object may fill a
+        few of its photos, and a sky may be cut out of those that show it: no points of the scene lie there.
+
+        Parameters
+        ----------
+        with_alpha : number of photos that may be transparent, of n.
+        """
+        per_view = with_alpha / len(self.views)
+        limit = n * (_MOST_CUT if len(self.xyz) else _MOST_CUT_WITHOUT_POINTS)
+        shares: list[float] = []
+        within, expected = 0, 0.0
+        for view in self.views:
+            if view.name not in self._parts:
+                with suppress(InputError):
+                    view.loaded()
+            part = self._parts.get(view.name)
+            if part is None:
+                continue
+            shares.append(part.share)
+            within += part.within
+            expected += part.share * part.inside
+            if len(shares) * per_view >= limit:
+                return None
+        if not shares or within < DENSITY * expected:
+            return None
+        number = f"{'about ' if per_view > 1 else ''}{round(len(shares) * per_view)} of {n}"
+        return (
+            f"{number} photos have transparent parts ({np.mean(shares):.0%} of their pixels), and the others are opaque"
+        )
 
 
 def bars_of(root: Path, posed: PosedImages, mask_of: Mapping[str, Path]) -> Bars:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import warnings
+from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +16,9 @@ from recorded_scenes import scene_and_warnings
 from clsplat.files.images import read_image, write_png
 from clsplat.scenes.colmap import Points
 from clsplat.scenes.posed_images import PosedImages
-from clsplat.scenes.scene import read_posed_images
+from clsplat.scenes.read_view import PhotoReader
+from clsplat.scenes.scene import load_scene, read_posed_images
+from clsplat.scenes.view import View
 from clsplat.scenes.without_data import use_of_alpha
 from clsplat.splats.color import BLACK
 
@@ -88,15 +92,49 @@ def test_without_points_most_photos_decide(cut: Callable[..., Path]) -> None:
         posed = replace(read_posed_images(folder, None), points=nothing)
         if use == "mask":
             with pytest.warns(UserWarning, match="4 of 10 photos have transparent parts"):
-                assert use_of_alpha(folder, posed, -1, BLACK) == use
+                assert use_of_alpha(folder, posed, -1, BLACK).use == use
         else:
-            assert use_of_alpha(folder, posed, -1, BLACK) == use
+            assert use_of_alpha(folder, posed, -1, BLACK).use == use
         shutil.rmtree(folder)
 
 
 def test_a_sky_that_was_cut_out_is_a_background(cut: Callable[..., Path]) -> None:
     """No points lie there. Some photos may show no sky."""
     folder = cut(4, range(4, N), rows=4)
-    assert use_of_alpha(folder, posed_without_points_above(folder), -1, BLACK) == "background"
+    assert use_of_alpha(folder, posed_without_points_above(folder), -1, BLACK).use == "background"
     with pytest.warns(UserWarning, match="4 of 10 photos have transparent parts"):
-        assert use_of_alpha(folder, read_posed_images(folder, None), -1, BLACK) == "mask"
+        assert use_of_alpha(folder, read_posed_images(folder, None), -1, BLACK).use == "mask"
+
+
+@pytest.mark.parametrize("n_cut", [0, 3, N], ids=["opaque", "some", "all"])
+@pytest.mark.parametrize("read_photos", [True, False])
+def test_photos_are_decoded_once_to_see_what_transparency_means(
+    cut: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, n_cut: int, read_photos: bool
+) -> None:
+    """Rims and cut-outs are looked for in the same pixels. Photos over the background are not decoded again."""
+    folder, decoded, read = cut(n_cut), list[str](), PhotoReader.read
+
+    def counted(self: PhotoReader, *arguments: Callable[..., None]) -> View | str:
+        decoded.append(self.photo.name)
+        return read(self, *arguments)
+
+    monkeypatch.setattr(PhotoReader, "read", counted)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = load_scene(folder, read_photos=read_photos, eval=False)
+    is_mask = scene.reading["alpha"] == "mask"
+    assert is_mask == (n_cut == 3)
+    assert Counter(decoded) == Counter(scene.names * (1 + is_mask))
+    known = load_scene(folder, alpha=scene.reading["alpha"], eval=False)
+    for view, other in zip(scene.views, known.views, strict=True):
+        np.testing.assert_array_equal(view.image, other.image)
+        np.testing.assert_array_equal(view.mask, other.mask)
+        np.testing.assert_array_equal(view.alpha, other.alpha)
+
+
+def test_views_are_returned_only_if_they_are_kept(cut: Callable[..., Path]) -> None:
+    folder = cut(0)
+    posed = read_posed_images(folder, None)
+    names = [photo.name for photo in posed.photos]
+    assert use_of_alpha(folder, posed, -1, BLACK).decoded == {}
+    assert list(use_of_alpha(folder, posed, -1, BLACK, names[2:4]).decoded) == names[2:4]

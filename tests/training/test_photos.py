@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,9 +50,9 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     names: list[str] = []
     read = PhotoReader.read
 
-    def counted(self: PhotoReader) -> View | str:
+    def counted(self: PhotoReader, *arguments: Callable[..., None]) -> View | str:
         names.append(self.photo.name)
-        return read(self)
+        return read(self, *arguments)
 
     monkeypatch.setattr(PhotoReader, "read", counted)
     return names
