@@ -137,15 +137,20 @@ def evaluate_models(
     refuse_existing([path for path in (comparison, numbers) if path is not None], overwrite)
     write = options.report and comparison is None
     evaluator = Evaluator(options, Renderer(device), write_reports=write, overwrite=overwrite)
+    scenes: list[Scene] = []
     if comparison is not None and len(paths) > 1:
-        first, *others = ((path, evaluator.view_sizes(load_model(path, iteration))) for path in paths)
-        for other in others:
-            if not _are_equal_views(first[1], other[1]):
-                raise InputError(_different(first[0], other[0], _ONE_SCENE))
+        sizes = []
+        for path in paths:
+            model = load_model(path, iteration)
+            scenes.append(evaluator.scene_of(model))
+            sizes.append(evaluator.view_sizes(model, scenes[-1]))
+            if not _are_equal_views(sizes[0], sizes[-1]):
+                raise InputError(_different(paths[0], path, _ONE_SCENE))
     measured = []
-    for path, name in zip(paths, names, strict=True):
+    for number, (path, name) in enumerate(zip(paths, names, strict=True)):
         folder = renders / name if renders is not None and len(paths) > 1 else renders
-        measured.append(evaluator(load_model(path, iteration), folder, progress))
+        scene = scenes[number] if scenes else None
+        measured.append(evaluator(load_model(path, iteration), folder, progress, scene))
         if not _are_equal_views(measured[0].view_sizes, measured[-1].view_sizes):
             if comparison is not None:  # a photo has become unreadable meanwhile
                 raise InputError(_different(paths[0], path, _ONE_SCENE))
@@ -190,12 +195,18 @@ class Evaluator:
         self.flip = Flip() if options.flip else None
 
     def __call__(
-        self, model: LoadedModel, renders: Path | None = None, progress: ViewProgress | None = None
+        self,
+        model: LoadedModel,
+        renders: Path | None = None,
+        progress: ViewProgress | None = None,
+        scene: Scene | None = None,
     ) -> ModelEvaluation:
-        """Return the measurements of a model. Parameters and errors are those of `evaluate`."""
-        options = self.options
-        background = model.background if options.background is None else options.background
-        scene = model.load_scene(options.scene, background=background)
+        """Return the measurements of a model. Other parameters and errors are those of `evaluate`.
+
+        scene : what `scene_of` has returned, if it is known.
+        """
+        options, background = self.options, self._background(model)
+        scene = scene or self.scene_of(model)
         views = self._views_of(scene, model)
         recorder = ViewRecorder(self.lpips, self.flip, options.report, options.protocol.corrected)
         names, numbers = [view.name for view in views], count(1)
@@ -223,14 +234,21 @@ class Evaluator:
         evaluation = ModelEvaluation(model, scene, result, per_view, recorder.images)
         return evaluation if model.folder is None else self._written(evaluation, model.folder)
 
-    def view_sizes(self, model: LoadedModel) -> dict[str, tuple[int, int]]:
+    def scene_of(self, model: LoadedModel) -> Scene:
+        """Return the scene of a model. Errors and warnings are those of `LoadedModel.load_scene`."""
+        return model.load_scene(self.options.scene, background=self._background(model))
+
+    def _background(self, model: LoadedModel) -> Color:
+        return model.background if self.options.background is None else self.options.background
+
+    def view_sizes(self, model: LoadedModel, scene: Scene) -> dict[str, tuple[int, int]]:
         """Return (width, height) [px] of the views of a model to measure, by name. No photo is decoded.
 
         Raises
         ------
-        InputError : the scene cannot be read, or has no such views.
+        InputError : the scene has no such views.
         """
-        views = self._views_of(model.load_scene(self.options.scene, check=False), model)
+        views = self._views_of(scene, model)
         return {view.name: (view.camera.width, view.camera.height) for view in views}
 
     def _views_of(self, scene: Scene, model: LoadedModel) -> list[View]:

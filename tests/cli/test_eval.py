@@ -12,10 +12,10 @@ from cli_runner import HEIGHT, ITERATIONS, TEST_NAMES, WIDTH, clsplat, error_of,
 from PIL import Image
 
 from clsplat.evaluation.metrics import protocol_named
-from clsplat.files.images import write_png
-from clsplat.models.model import load_model
+from clsplat.files.images import read_image, write_png
+from clsplat.models.model import LoadedModel, load_model
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.splats.splats import Splats
 
 
@@ -113,6 +113,44 @@ def test_models_of_different_views_are_refused_before_they_are_measured(
     assert f"{models[1]} and {models[0]} are measured on different views or sizes: compare models of one scene" in said
     assert not [path for path in models if (path / "results.json").exists()]
     assert not (tmp_path / "r.html").exists()
+
+
+@pytest.mark.parametrize("report", [True, False])
+def test_the_scene_of_a_model_is_read_once(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, report: bool
+) -> None:
+    """A common report needs the views of all models before the first one is measured."""
+    loaded: list[Path] = []
+    load = LoadedModel.load_scene
+
+    def counted(self: LoadedModel, *arguments: object, **options: object) -> Scene:
+        loaded.append(self.path)
+        return load(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(LoadedModel, "load_scene", counted)
+    models = [model, tmp_path / "other"]
+    shutil.copytree(*models)
+    clsplat("eval", *models, *(("--report", tmp_path / "both.html") if report else ("--no-report",)))
+    assert loaded == models
+
+
+def test_changed_photos_are_refused_before_a_model_is_measured(
+    model: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if they are those of the second model."""
+    moved, other = tmp_path / "yard", tmp_path / "other"
+    shutil.copytree(scene, moved)
+    shutil.copytree(model, other)
+    photo = sorted((moved / "images").iterdir())[0]
+    write_png(photo, 255 - read_image(photo))
+    stored = json.loads((other / "config.json").read_text())
+    stored["scene"]["path"] = str(moved)
+    (other / "config.json").write_text(json.dumps(stored))
+    measured: list[str] = []
+    monkeypatch.setattr("clsplat.models.evaluation.evaluate_views", lambda *_, **__: measured.append("one"))
+    said = error_of("eval", model, other, "--report", tmp_path / "r.html")
+    assert f"1 of 10 photos or masks have changed since {other} was trained" in said
+    assert not measured
 
 
 # --- files of splats ---------------------------------------------------------------------------

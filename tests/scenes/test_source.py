@@ -92,7 +92,7 @@ def test_a_part_opens_only_its_own_photos(folder: Path, monkeypatch: pytest.Monk
             file.write_bytes(file.read_bytes()[:200])  # the size is still there
     opened: list[str] = []
     read = PhotoReader.read
-    monkeypatch.setattr(PhotoReader, "read", lambda self: opened.append(self.photo.name) or read(self))
+    monkeypatch.setattr(PhotoReader, "read", lambda self, *look: opened.append(self.photo.name) or read(self, *look))
     part = source.load()
     assert sorted(opened) == sorted(part.names) == sorted(names)
     assert set(part.photo_digests) == set(names)
