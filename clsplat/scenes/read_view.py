@@ -15,7 +15,7 @@ from .. import activity
 from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.host_memory import give_back_free_memory
-from ..files.images import ImageU8, is_whole, read_image, resize_area
+from ..files.images import ImageU8, has_alpha, is_whole, read_image, resize_area
 from ..files.masks import Mask, read_mask, resize_mask
 from ..splats.color import Color
 from .bars import NO_BARS, Bars
@@ -110,10 +110,7 @@ class PhotoReader:
             return str(error)
         if look is not None:
             look(stored)
-        width, height = self.size
-        masks = [] if self.mask_file is None else [read_mask(self.mask_file)]
-        if any(self.bars):
-            masks.append(self.bars.uncovered(width, height, _SOFT_ROWS))
+        masks = self._stored_masks()
         alpha = None
         if stored.shape[2] == 4:
             alpha = stored[:, :, 3].copy()  # a slice would keep the whole photo in memory
@@ -135,8 +132,35 @@ class PhotoReader:
         if mask is None:
             return view
         if not mask.any():
-            return f"{self.file}: its mask hides every pixel"
+            return self._all_hidden
         return replace(view, mask=None) if mask.all() else view
+
+    def unusable(self) -> str | None:
+        """Return the reason why the photo cannot be used, as far as a check shows it; None without one.
+
+        The photo is decoded only if its transparency is a mask, or if its file does not end as it should.
+
+        Raises
+        ------
+        InputError : as `read`.
+        """
+        if not is_whole(self.file) or (self.alpha_hides and has_alpha(self.file)):
+            found = self.read()
+            return found if isinstance(found, str) else None
+        masks, camera = self._stored_masks(), self.camera()
+        shown = not masks or self._fitted_mask(masks, (camera.width, camera.height)).any()
+        return None if shown else self._all_hidden
+
+    @property
+    def _all_hidden(self) -> str:
+        return f"{self.file}: its mask hides every pixel"
+
+    def _stored_masks(self) -> list[Mask]:
+        """Return the masks that do not need the photo: of a file, and of bars."""
+        masks = [] if self.mask_file is None else [read_mask(self.mask_file)]
+        if any(self.bars):
+            masks.append(self.bars.uncovered(*self.size, _SOFT_ROWS))
+        return masks
 
     def opaque_part(self, stored: ImageU8) -> Mask:
         """Return which pixels of the view are at least half opaque. stored : (H, W, 4), as of `read`."""
@@ -170,8 +194,8 @@ def read_views(
 
     Parameters
     ----------
-    now : whether to decode each photo now and keep it. Other photos become a `StoredView`. They are decoded once to
-        check them only if their files do not end as they should, or if their masks may hide everything.
+    now : whether to decode each photo now and keep it. Other photos become a `StoredView` and are checked
+        (`PhotoReader.unusable`).
     decoded : views by name that were read before, of photos without masks.
     """
     numbers, n, known = itertools.count(1), sum(now), decoded or {}
@@ -180,11 +204,11 @@ def read_views(
         if keep:
             activity.report(f"reading photo {next(numbers)} of {n}")
         view = known.get(reader.photo.name) if keep and not reader.may_hide_pixels else None
-        if view is None and (keep or reader.may_hide_pixels or not is_whole(reader.file)):
-            found = reader.read()
+        if view is None:
+            found = reader.read() if keep else reader.unusable()
             if isinstance(found, str):
                 return found
-            view = found if keep else None
+            view = found
         return StoredView(
             reader.photo.name, reader.camera(), reader.view, reader.decoding_bytes, view, reader.may_hide_pixels
         )

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import zlib
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,10 +85,23 @@ def test_only_training_photos_are_decoded(tmp_path: Path, decoded: list[str]) ->
 
 
 def test_photos_that_were_only_checked_are_not_kept(tmp_path: Path, decoded: list[str]) -> None:
-    """A mask might hide everything, so even test photos are decoded once."""
-    scene = load_scene(write_frames(tmp_path, 0.0, False, True))
-    assert set(decoded) == {Path(name).name for name in scene.names}
+    """Transparency might hide everything, so even test photos are decoded once."""
+    scene = load_scene(write_frames(tmp_path, 0.0, True, False), alpha="mask")
+    assert Counter(decoded) == Counter(Path(name).name for name in scene.names)
     assert [view.is_kept for view in scene.test if isinstance(view, StoredView)] == [False] * len(scene.test)
+
+
+@pytest.mark.parametrize("reading", [{}, {"bars": (0.1, 0.0, 0.0, 0.0)}, {"alpha": "mask"}])
+def test_masks_are_checked_without_their_photos(tmp_path: Path, decoded: list[str], reading: dict[str, object]) -> None:
+    """Those of files and of bars, and of photos that cannot be transparent."""
+    folder = write_frames(tmp_path, 0.0, False, True)
+    hidden = sorted((folder / "masks" / "images").iterdir())[0]
+    write_png(hidden, np.zeros((SIZE[1], SIZE[0]), np.uint8))
+    with pytest.warns(UserWarning, match=r"1 of 9 photos .* its mask hides every pixel"):
+        scene = load_scene(folder, read_photos=False, **reading)  # type: ignore[arg-type]
+    assert not decoded
+    assert list(scene.left_out) == [f"images/{hidden.name}"]
+    assert all(view.may_hide_pixels for view in scene.views)
 
 
 def test_photos_are_kept_and_released_on_demand(tmp_path: Path, decoded: list[str]) -> None:
