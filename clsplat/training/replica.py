@@ -69,10 +69,10 @@ class Replica:
         self.loss = ImageLoss(self.pipeline.pool, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)
         check_loss(device, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)
         check_step(device, kernels, config.sghmc.position_optimizer)
+        if usual is None and config.appearance.exposure and config.appearance.exposure_rate > 0:
+            usual = usual_exposures(scene.train, scene.points)  # before the device has the photos and they are given up
         channels = target_channels(scene.train, config)
         self.targets = Targets(device, kernels, scene.train, target_budget(device), channels)
-        if usual is None and config.appearance.exposure and config.appearance.exposure_rate > 0:
-            usual = usual_exposures(scene.train, scene.points)
         self.exposure = PhotoLoss(self.loss, self.targets, config, config.background, usual)
         self.dropout = SplatDropout(config, self.splats)
         self.smoothness = DepthSmoothness(config, kernels, self.splats, scene.train, max_isects)
