@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..scenes.distinct_points import distinct
 from ..scenes.scene import Scene
 from ..splats.splats import Splats
 from ..splats.transform import joined
 from ..training.config import TrainConfig
-from ..training.initialise import MIN_POINTS, best_observed, distinct, started
+from ..training.initialise import MIN_POINTS, best_observed, started
 from .cells import Cells
 
 

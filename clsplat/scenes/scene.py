@@ -24,6 +24,7 @@ from .bars import NO_BARS, checked_bars, commonest_size
 from .colmap import Points
 from .colmap_folder import colmap_folder, model_suffix
 from .described import read_described
+from .distinct_points import without_copies
 from .extent import extent_of
 from .options import ALPHA_USES, ORIGIN, TEST_EVERY
 from .origin import near_origin, size_of
@@ -346,7 +347,7 @@ def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | 
     size = size_of(posed)
     posed = with_upright_photos(near_origin(root, posed, size, origin))
     check_poses(root, posed, size)
-    return replace(posed, points=without_far_points(root, posed.points))
+    return replace(posed, points=without_copies(root, without_far_points(root, posed.points)))
 
 
 def _needs_hint(root: Path, images: str | None) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.stop_signals import held
+from ..scenes.distinct_points import distinct
 from ..splats.approximate import nearest_of_shape
 from ..splats.fields import Array, sh_coefficients
 from ..splats.formats.any_file import READ_ENDINGS
@@ -179,17 +180,6 @@ def nearest_of(xyz: Array, to: Array) -> NDArray[np.int64]:
 
     with held():
         return np.asarray(cKDTree(xyz).query(to, workers=-1)[1], np.int64)
-
-
-def distinct(xyz: Array) -> NDArray[np.int64]:
-    """Return the indices of the first point in each place, in rising order.
-
-    Points in one place have a distance of zero, which cannot give the size of a splat. One splat represents them all.
-    """
-    order = np.lexsort(xyz.T)
-    same = np.zeros(len(xyz), np.bool_)
-    same[order[1:]] = (xyz[order[1:]] == xyz[order[:-1]]).all(axis=1)  # lexsort is stable: the first comes first
-    return np.flatnonzero(~same)
 
 
 def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene: Scene) -> NDArray[np.int64]:
