@@ -115,6 +115,8 @@ def _content(scene: Scene) -> str:
     """Return the digest of all that a run learns from or is measured on."""
     digest = hashlib.sha256()
     reading = {key: scene.reading.get(key) for key in ("alpha", "bars")}
+    if scene.reading.get("rim"):  # rows of older versions stay valid for scenes without a rim
+        reading["rim"] = True
     digest.update(json.dumps(reading, sort_keys=True).encode())
     for views in (scene.train, scene.test):
         digest.update(f"\n{len(views)} views\n".encode())

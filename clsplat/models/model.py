@@ -141,6 +141,7 @@ class LoadedModel:
             read_photos=False,
             origin=origin,
             bars=record.get("bars") or BEFORE["bars"],
+            rim=bool(record.get("rim")),
         )
         as_recorded = all(getattr(choice, name) in (None, record.get(name)) for name in ("images", "masks"))
         if check and as_recorded:

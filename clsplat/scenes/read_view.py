@@ -6,7 +6,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +45,7 @@ class PhotoReader:
     alpha_hides : whether transparency is a mask.
     bars : bars of the photo, which are masked out.
     upright : whether the photo is turned by its EXIF orientation.
+    rim : pixels of a rim around the photo, (H, W), which are masked out; None without a rim.
     """
 
     photo: RegisteredImage
@@ -56,6 +57,7 @@ class PhotoReader:
     alpha_hides: bool
     bars: Bars = NO_BARS
     upright: bool = False
+    rim: Mask | None = field(default=None, compare=False)
 
     @classmethod
     def of(
@@ -67,11 +69,12 @@ class PhotoReader:
         mask_file: Path | None = None,
         alpha_hides: bool = False,
         bars: Bars = NO_BARS,
+        rim: Mask | None = None,
     ) -> PhotoReader:
         """Return the reader of one of the photos of a scene."""
         name = photo.name
         file, size, upright = posed.files[name], posed.sizes[name], name in posed.upright
-        return cls(photo, file, size, resolution, background, mask_file, alpha_hides, bars, upright)
+        return cls(photo, file, size, resolution, background, mask_file, alpha_hides, bars, upright, rim)
 
     @property
     def decoding_bytes(self) -> int:
@@ -82,7 +85,7 @@ class PhotoReader:
     @property
     def may_hide_pixels(self) -> bool:
         """Whether a mask may hide some of the pixels, or all."""
-        return self.mask_file is not None or self.alpha_hides or any(self.bars)
+        return self.mask_file is not None or self.alpha_hides or any(self.bars) or self.rim is not None
 
     def camera(self) -> Camera:
         """Return the camera of the view without decoding the photo; raises as `RegisteredImage.fit`."""
@@ -156,10 +159,12 @@ class PhotoReader:
         return f"{self.file}: its mask hides every pixel"
 
     def _stored_masks(self) -> list[Mask]:
-        """Return the masks that do not need the photo: of a file, and of bars."""
+        """Return the masks that do not need the photo: of a file, of bars, and of a rim."""
         masks = [] if self.mask_file is None else [read_mask(self.mask_file)]
         if any(self.bars):
             masks.append(self.bars.uncovered(*self.size, _SOFT_ROWS))
+        if self.rim is not None:
+            masks.append(~self.rim)
         return masks
 
     def opaque_part(self, stored: ImageU8) -> Mask:

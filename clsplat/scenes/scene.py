@@ -38,6 +38,7 @@ from .pose_checks import (
 )
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
+from .rims import rim_of
 from .scene_files import SCENE_ENDINGS, described_by
 from .turned_photos import with_upright_photos
 from .view import View
@@ -133,6 +134,7 @@ def load_scene(
     only: Collection[str] | None = None,
     origin: Sequence[float] | None = None,
     bars: Sequence[float] | None = None,
+    rim: bool | None = None,
 ) -> Scene:
     """Read a scene: a folder with photos and their cameras.
 
@@ -153,7 +155,7 @@ def load_scene(
     eval : whether to hold out test views; if False, all views are training views.
     background : colour 0..1 under transparent pixels.
     masks : folder of masks inside the scene (see files/masks.py), or "none" for no masks. By default "masks" if it
-        exists, the masks named in transforms.json, and masks beside photos. "none" keeps bars, too.
+        exists, the masks named in transforms.json, and masks beside photos. "none" keeps bars and rims, too.
     alpha : use of a photo's transparency. "background" composites the photo over the background; "mask" masks out
         pixels that are less than half opaque. By default it is "background", but "mask" if the same pixels are
         transparent in all photos and points lie there: rims that undistortion leaves without data. So it is if some
@@ -167,6 +169,8 @@ def load_scene(
     bars : parts of the height and width, 0 to 1, at the top, right, bottom and left that are masked out, (4,). They are
         those of photos of the commonest size. By default, bars of one colour that all photos have are masked out if
         points lie there.
+    rim : whether a rim of one colour around all photos of the commonest size is masked out, as that of a fisheye lens.
+        By default it is if points lie there, and neither `bars` are named nor others found.
 
     Warns
     -----
@@ -197,9 +201,11 @@ def load_scene(
         kept = {photo.name for photo, now in zip(photos, decoded, strict=True) if now} - mask_of.keys()
         alpha, known = use_of_alpha(root, posed, resolution, background, kept)
     if masks == NO_MASKS:
-        bars = NO_BARS
+        bars, rim = NO_BARS, False
+    looks_for_rim = bars is None if rim is None else rim
     bars = bars_of(root, posed, mask_of) if bars is None else checked_bars(bars)
-    barred_size = commonest_size(posed.sizes)
+    found = rim_of(root, posed, mask_of, known=bool(rim)) if looks_for_rim and bars == NO_BARS else None
+    usual_size = commonest_size(posed.sizes)
     readers = [
         PhotoReader.of(
             posed,
@@ -208,7 +214,7 @@ def load_scene(
             background,
             mask_of.get(photo.name),
             alpha == "mask",
-            bars if posed.sizes[photo.name] == barred_size else NO_BARS,
+            *((bars, found) if posed.sizes[photo.name] == usual_size else (NO_BARS, None)),
         )
         for photo in photos
     ]
@@ -241,6 +247,7 @@ def load_scene(
             eval=eval,
             origin=list(posed.origin) if any(posed.origin) else None,
             bars=list(bars),
+            rim=found is not None,
         ),
         left_out,
         digest_of,
@@ -301,7 +308,7 @@ def _files_of(name: str, posed: PosedImages, mask_of: Mapping[str, Path]) -> lis
 
 
 def _reading(*, eval: bool, **arguments: Any) -> dict[str, Any]:
-    """Return a record of `load_scene`'s arguments: None for default values; `eval`, `alpha` and `bars` have values."""
+    """Return a record of `load_scene`'s arguments: None for defaults. `eval`, `alpha`, `bars`, `rim` have values."""
     parameters = inspect.signature(load_scene).parameters
     record = {name: None if value == parameters[name].default else value for name, value in arguments.items()}
     return record | {"eval": bool(eval), "alpha": arguments["alpha"]}

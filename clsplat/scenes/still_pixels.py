@@ -23,7 +23,9 @@ from .view import View
 
 FEWEST_VIEWS = 6  # fewer photos may agree by chance
 _FEWEST_POINTS = 50  # points in all photos together, in the pixels that do not change
-_LEAST, _MOST = 0.01, 0.3  # of a photo: less is harmless, more is the background of an object
+LEAST, _MOST = 0.01, 0.3  # of a photo: less is harmless, more is the background of an object
+MOST_OF_RIM = 0.8  # of a photo, if what all photos show has the same outline
+ALIKE_OUTLINES = 0.9  # of what any photo shows, the mean share that a photo shows: those of objects differ
 # Least points a pixel, in units of the mean of the photo. Points gather in the middle of photos, far from rims.
 DENSITY = 0.03
 _EMPTY = 8  # largest alpha of a pixel without data
@@ -51,21 +53,23 @@ def pixels_before_scene(views: Sequence[View], xyz: DoubleArray) -> StillPixels 
     alike = [view for view in views if (view.camera.width, view.camera.height) == size]
     if count < FEWEST_VIEWS:
         return None
-    still, is_empty = still_pixels(sampled_views(alike))
-    if not hide_points(float(still.mean()), ((view.camera, still) for view in alike), xyz):
+    still, is_empty, is_rim = still_pixels(sampled_views(alike))
+    limit = MOST_OF_RIM if is_rim else _MOST
+    if not hide_points(float(still.mean()), ((view.camera, still) for view in alike), xyz, limit):
         return None
     return StillPixels(float(still.mean()), is_empty)
 
 
-def hide_points(share: float, parts: Iterable[tuple[Camera, Mask]], xyz: DoubleArray) -> bool:
+def hide_points(share: float, parts: Iterable[tuple[Camera, Mask]], xyz: DoubleArray, limit: float = _MOST) -> bool:
     """Return whether points of the scene lie in parts of photos, which are neither tiny nor most of the photos.
 
     Parameters
     ----------
     share : of the pixels of a photo in its part, 0 to 1. Parts of another size than is possible are not looked at.
     parts : camera of each photo, and the part of it, (H, W) bool. xyz : points of the scene (P, 3).
+    limit : largest share of the pixels, and of the points.
     """
-    if not _LEAST <= share <= _MOST:
+    if not LEAST <= share <= limit:
         return False
     some = sampled(xyz)
     inside, within = 0, 0
@@ -73,11 +77,13 @@ def hide_points(share: float, parts: Iterable[tuple[Camera, Mask]], xyz: DoubleA
         found = seen(camera, some)
         inside += int(np.count_nonzero(found.inside))
         within += int(np.count_nonzero(part[found.rows_and_columns]))
-    return within >= _FEWEST_POINTS and DENSITY * share <= within / inside <= _MOST
+    return within >= _FEWEST_POINTS and DENSITY * share <= within / inside <= limit
 
 
-def still_pixels(views: Sequence[View]) -> tuple[Mask, bool]:
-    """Return the pixels that are transparent in all photos, or else of one colour, (H, W), and whether it is the first.
+def still_pixels(views: Sequence[View]) -> tuple[Mask, bool, bool]:
+    """Return the pixels that are transparent in all photos, or else of one colour, (H, W).
+
+    Two further results say whether they are transparent, and whether what the photos show then has the same outline.
 
     Transparent pixels count only if they are about the same in all photos. Else they are around the silhouettes of an
     object.
@@ -106,6 +112,8 @@ def still_pixels(views: Sequence[View]) -> tuple[Mask, bool]:
         np.maximum(high, photo.image, out=high)
     if empty is not None:
         alike = len(views) * int(np.count_nonzero(empty)) >= _ALIKE * transparent
-        return counted & empty & alike, True
+        n_shown = len(views) * empty.size - transparent
+        is_rim = n_shown >= ALIKE_OUTLINES * len(views) * int(np.count_nonzero(~empty))
+        return counted & empty & alike, True, is_rim
     still: Mask = (high - low).max(axis=2) <= SPREAD
-    return counted & still, False
+    return counted & still, False, False

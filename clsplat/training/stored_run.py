@@ -132,6 +132,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "eval": ("true or false", lambda value: isinstance(value, bool)),
     "origin": ("three numbers", _is_place),
     "bars": ("four parts from 0 to 1", _are_parts),
+    "rim": ("true or false", lambda value: isinstance(value, bool)),
     "photos": ("the digest of each photo by name", lambda value: isinstance(value, dict)),
     "test_names": ("a list of names", _is_list_of_names),
     "validation_names": ("a list of names", _is_list_of_names),

@@ -48,6 +48,24 @@ def test_rims_without_data_are_left_out(rims: Path) -> None:
         assert (scene.train[0].mask is None) == (alpha == "background")
 
 
+def test_most_of_a_photo_may_be_a_rim(rims: Path) -> None:
+    """As around the image circle of a fisheye lens. What the photos show has the same outline."""
+    for file in (rims / "images").iterdir():
+        pixels = read_image(file)
+        pixels[:10, :, 3] = 0
+        pixels[-10:, :, 3] = 0
+        write_png(file, pixels)
+    scene, said = scene_and_warnings(rims)
+    assert "56% of the pixels are transparent in all photos, but points of the scene lie there" in said
+    assert scene.reading["alpha"] == "mask"
+    for number, file in enumerate(sorted((rims / "images").iterdir())):
+        pixels = read_image(file)
+        pixels[10 + number % 2 : -10 : 2, :, 3] = 0
+        write_png(file, pixels)
+    scene, said = scene_and_warnings(rims)
+    assert "transparent in all photos" not in said, "a photo shows half of what all show"
+
+
 def test_a_part_of_a_scene_is_read_as_the_whole(rims: Path) -> None:
     scene, _ = scene_and_warnings(rims, only=[load_scene(rims, alpha="mask").names[3]])
     assert len(scene.views) == 1
@@ -94,8 +112,9 @@ def test_still_pixels_are_those_that_vary_by_noise_only(scene: Scene) -> None:
         image[:ROWS] = 100 + rng.integers(-2, 3, image[:ROWS].shape)
         image[-ROWS:] = 0
         views.append(View(view.name, view.camera, np.clip(image, 0, 255).astype(np.uint8)))
-    still, is_empty = still_pixels(views)
+    still, is_empty, is_rim = still_pixels(views)
     assert not is_empty
+    assert not is_rim
     assert still[:ROWS].all()
     assert still[-ROWS:].all()
     assert still[ROWS:-ROWS].mean() < 0.05
