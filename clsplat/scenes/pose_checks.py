@@ -25,6 +25,9 @@ _TOO_FAR = 1e6  # sizes of the scene from the origin: steps of float32 are a twe
 _DIGITS = 9  # poses that agree to these decimals count as equal
 _MOST_DECODED = 8  # pairs of photos with equal poses whose pixels are compared, which takes time
 _LEAST_FOCAL = 1e-3  # of the side of an image: an angle of view of 179.9 degrees
+_WIDEST = 0.05  # focal length by the side of an image: an angle of view of 169 degrees, which no pinhole image has
+# From the middle of an image to the principal point, by the side: photos that are cut to three quarters have 0.17.
+_OFF_CENTRE = 0.45
 _UNEVEN = 2.0  # largest ratio of the focal lengths of a photo that goes without a warning
 _SEEN_SHARE = 0.01  # of the points that some image must show
 _SHRUNK, _GROWN = 0.21, 1.99  # COLMAP's undistortion scales a side by 0.2 to 2; such sides are at the limits
@@ -149,14 +152,15 @@ def check_lenses(root: Path, posed: PosedImages) -> None:
 
     Warns
     -----
-    UserWarning : a lens distorts more than undistortion can follow, or its focal lengths are far from each other.
+    UserWarning : a lens distorts more than undistortion can follow, or its focal lengths are far from each other. Its
+        angle of view is nearly 180 degrees, or its principal point is at a side of the image or outside.
 
     Raises
     ------
     InputError : a focal length is below a thousandth of its side, or as `RegisteredImage.fit`.
     """
     scales: dict[tuple[object, ...], tuple[float, float]] = {}
-    strange, uneven = [], []
+    strange, uneven, odd = [], [], []
     for photo in posed.photos:
         lens, (width, height) = photo.lens, posed.sizes[photo.name]
         key = (lens.model, lens.width, lens.height, *lens.params, width, height)
@@ -170,6 +174,8 @@ def check_lenses(root: Path, posed: PosedImages) -> None:
             scales[key] = camera.width / width, camera.height / height
             if not 1 / _UNEVEN < camera.fx / camera.fy < _UNEVEN:
                 uneven.append((photo, camera))
+            if fault := _fault_of(camera):
+                odd.append((photo, fault))
         if min(scales[key]) <= _SHRUNK or min(scales[key]) >= _GROWN:
             strange.append((photo, width, height, scales[key]))
     if uneven:
@@ -177,6 +183,13 @@ def check_lenses(root: Path, posed: PosedImages) -> None:
         warnings.warn(
             f"{root}: the focal lengths of {photo.name!r} are {camera.fx:g} and {camera.fy:g} px; pixels are seldom so "
             "far from square. Check its lens",
+            stacklevel=3,
+        )
+    if odd:
+        photo, fault = odd[0]
+        warnings.warn(
+            f"{root}: the lens of {photo.name!r} has {fault}: it is wrong, or of another size of the photos; "
+            "correct it",
             stacklevel=3,
         )
     if strange:
@@ -188,3 +201,13 @@ def check_lenses(root: Path, posed: PosedImages) -> None:
             f"px. Check its {photo.lens.model.name} parameters ({values})",
             stacklevel=3,
         )
+
+
+def _fault_of(camera: Camera) -> str:
+    """Return words for what no usual pinhole image has: a very wide angle, or a principal point far from its middle."""
+    size = f"an image of {camera.width}x{camera.height} px"
+    if camera.fx < _WIDEST * camera.width or camera.fy < _WIDEST * camera.height:
+        return f"focal lengths of {camera.fx:.3g} and {camera.fy:.3g} px for {size}"
+    if max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5)) > _OFF_CENTRE:
+        return f"its principal point at ({camera.cx:.4g}, {camera.cy:.4g}) px in {size}"
+    return ""

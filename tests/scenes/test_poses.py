@@ -187,6 +187,36 @@ def test_lenses_beyond_undistortion_are_named(tmp_path: Path, k1: float, size: s
     assert f"40x30 px become {size} px" in run("info", tmp_path).stderr
 
 
+@pytest.mark.parametrize(
+    ("lens", "fault"),
+    [
+        ({"fl_x": 132.0, "cx": 80.0, "cy": 60.0}, r"its principal point at \(80, 60\) px in an image of 40x30 px"),
+        ({"fl_x": 33.0, "cx": 0.5, "cy": 0.5}, r"its principal point at \(0\.5, 0\.5\) px in an image of 40x30 px"),
+        ({"fl_x": 0.8, "fl_y": 1.1}, r"focal lengths of 0\.8 and 1\.1 px for an image of 40x30 px"),
+        ({"fl_x": 33.0, "cx": 10.0, "cy": 22.0}, ""),
+        ({"fl_x": 4.0}, ""),
+    ],
+)
+def test_lenses_of_another_size_are_named(tmp_path: Path, lens: dict[str, float], fault: str) -> None:
+    """Keys may be those of the unreduced photos, or in parts of their size. What was cut out has a usual lens."""
+    for index, view in enumerate(model_views()):
+        write_png(tmp_path / view.name, photo_of(index))
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": view.name, "transform_matrix": (np.linalg.inv(view.cam_from_world) @ flip).tolist()}
+        for view in model_views()
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_scene(tmp_path)
+    said = [str(one.message) for one in caught if "the lens of" in str(one.message)]
+    assert len(said) == bool(fault)
+    assert all(
+        re.search(rf"the lens of '.*shot_0\.png' has {fault}: it is wrong, or of another size", one) for one in said
+    )
+
+
 def test_points_that_no_photo_shows_are_left_out(garden: Path) -> None:
     """They are of other poses. Splats that start there would have to be removed first."""
     write_model(garden, moved(), shift=-500.0)
