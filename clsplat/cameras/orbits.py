@@ -20,6 +20,7 @@ _PARALLEL = 5e-3
 # Cameras that look ahead: shortest mean of their axes, and how far these miss the point nearest to all, in units of the
 # cameras' spread side by side. The square of this ratio is about the part by which the point is too near.
 _ONE_DIRECTION, _MISSED = 0.9, 0.5
+ROUNDING = 1e-12  # of the distance from the origin: centres closer than this are one place
 # Weight of the cameras' mean up direction against levelling: a variance of the x axes about level, (6 degrees)^2.
 _LEVELLING = 1e-2
 # Default cameras: 3DGS worlds are camera worlds, whose y axis points down. Images are 60 degrees wide, 4:3.
@@ -187,6 +188,12 @@ def where_axes_meet(cameras: Sequence[Camera]) -> DoubleArray | None:
     point = np.asarray(np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(cameras)), np.float64)
     missed = np.einsum("nij,nj->ni", across, point - centres)
     return None if _look_ahead(centres, axes, missed) else point
+
+
+def in_one_place(centres: DoubleArray) -> bool:
+    """Return whether centres (N, 3) differ by no more than rounding, as those of a panorama."""
+    largest = float(np.abs(centres).max())
+    return bool(np.abs(centres - centres.mean(axis=0)).max() <= ROUNDING * largest)
 
 
 def _look_ahead(centres: DoubleArray, axes: DoubleArray, missed: DoubleArray) -> bool:

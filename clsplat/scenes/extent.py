@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..cameras.orbits import where_axes_meet
+from ..cameras.orbits import in_one_place, where_axes_meet
 from ..cameras.seen import sampled, seen
 from ..splats.fields import DoubleArray
 
@@ -39,7 +39,8 @@ def extent_of(cameras: Sequence[Camera], xyz: DoubleArray) -> float:
     cameras : training cameras, at least one. xyz : (P, 3) points of the scene; P may be 0.
     """
     cameras = together(cameras)
-    extent, some = _reach(np.array([camera.position for camera in cameras])), sampled(xyz)
+    centres, some = np.array([camera.position for camera in cameras]), sampled(xyz)
+    extent = 0.0 if in_one_place(centres) else _reach(centres)
     cameras = cameras[:: -(-len(cameras) // _MAX_CAMERAS)]
     middle = _depths_of_middle(cameras)
     if (width := _width_at_points(cameras, some, _MIDDLE)) is not None:
@@ -47,7 +48,7 @@ def extent_of(cameras: Sequence[Camera], xyz: DoubleArray) -> float:
         if np.isfinite(middle).mean() < _AROUND and (near := _width_at_points(cameras, some, _NEAREST)) is not None:
             largest = min(largest, _LARGEST_OF_WALK * near)
         extent = max(min(extent, largest), _SMALLEST * width)
-    elif np.isfinite(middle).all():
+    elif extent > 0 and np.isfinite(middle).all():
         widths = [_half_diagonal(camera) * depth for camera, depth in zip(cameras, middle, strict=True)]
         extent = min(extent, _LARGEST * float(np.median(widths)))
     return extent if extent > 0 else 1.0

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.orbits import ROUNDING
 from ..cameras.seen import sampled, sampled_views
 from ..errors import InputError
 from ..splats.fields import Array
@@ -25,7 +26,6 @@ _STEP_SHARE = 0.5
 _LONG = FAR / 100.0  # scenes nearer to the origin, in units of their size, are no case for this rule
 _NEAREST = 0.1  # part of the points in an image that are nearer than its details
 _FEWEST_POINTS = 5  # in an image, to tell where its details are
-_ROUNDING = 1e-14  # of the distance from the origin: places closer than this are one place
 _LOST = 1e10  # beyond this distance, float64 has lost the scene, too
 
 
@@ -104,7 +104,7 @@ def _spread(xyz: NDArray[np.float64]) -> float:
     middle = np.median(xyz, axis=0)
     with np.errstate(over="ignore"):  # outliers may be at any distance
         spread = float(np.median(np.abs(xyz - middle).max(axis=1)))
-    return 0.0 if spread <= _ROUNDING * np.abs(middle).max() else spread
+    return 0.0 if spread <= ROUNDING * np.abs(middle).max() else spread
 
 
 def _ratio(centre: NDArray[np.float64], size: float) -> float:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.orbits import where_axes_meet
+from ..cameras.orbits import in_one_place, where_axes_meet
 from ..cameras.seen import seen
 from ..scenes.extent import together
 from ..splats.fields import DoubleArray
@@ -75,7 +75,7 @@ class _Sight:
         centres = np.array([camera.position for camera in cameras])
         self.middle = _middle(self.cameras, scene.extent)
         unit = float(np.median(np.linalg.norm(centres - self.middle, axis=1)))
-        self.unit = unit if unit > 0 else 1.0
+        self.unit = unit if unit > 0 and not in_one_place(centres) else 1.0
         self.min_cameras = min(SEEN_BY, len(self.cameras))
 
     def draw(self, count: int, rng: np.random.Generator) -> DoubleArray:

@@ -85,6 +85,13 @@ def test_cameras_that_look_ahead_and_all_cameras_in_one_place() -> None:
     assert extent_of(row[:1] * 3, cloud(1.0, (0.0, -5.0, 0.0))) == 1.0, "they see no points"
 
 
+def test_centres_that_differ_by_rounding_are_one_place() -> None:
+    place = np.array([3.6, 0.1, 0.7])
+    turned = [camera(place, place + (np.cos(angle), np.sin(angle), 0.3 * angle)) for angle in np.arange(12) / 2]
+    assert 0 < published(turned) < 1e-14
+    assert extent_of(turned, NOTHING) == 1.0
+
+
 def test_few_points_in_an_image_do_not_count() -> None:
     assert extent_of(ring(4.0), cloud()[:19]) == published(ring(4.0))
     far = ring(160.0, 4000.0)

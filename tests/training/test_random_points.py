@@ -74,6 +74,17 @@ def test_one_camera_and_cameras_in_one_place_do() -> None:
     assert np.isfinite(xyz).all()
 
 
+def test_centres_that_differ_by_rounding_are_one_place() -> None:
+    """Photos of a tripod, whose poses are matrices: the points were within 1e-14 units."""
+    place = np.array([3.6, 0.1, 0.7])
+    angles = np.arange(12) / 2
+    away = np.stack([np.cos(angles), np.sin(angles), 0.3 * angles], axis=1)
+    turned = [looking(place[None], place + ahead)[0] for ahead in away]
+    assert np.ptp([camera.position for camera in turned], axis=0).max() > 0
+    xyz = random_points(scene(turned, 1.0), 200, np.random.default_rng(0))
+    assert 0.2 < np.median(np.linalg.norm(xyz - place, axis=1)) < 5.0
+
+
 def test_light_reaches_the_middle_of_the_largest_random_start() -> None:
     """Inside an opaque fog no splat has a gradient. Training failed with a transmittance of 1e-8."""
     density = Mcmc()
