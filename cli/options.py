@@ -203,7 +203,7 @@ def hiding_options(function: F) -> F:
     function = click.option(
         "--alpha",
         type=click.Choice(ALPHA_USES),
-        help="Transparent photos: composite them over the background, or ignore the transparent pixels.  "
+        help="Transparent photos: composite them over the background, ignore the transparent pixels, or ignore alpha.  "
         "[default: background; mask, if the same pixels are transparent in all photos and points lie there]",
     )(function)
     return click.option(

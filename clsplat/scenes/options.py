@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-ALPHA_USES = ("background", "mask")  # transparent pixels are composited over the background, or are masked out.
+# Transparent pixels are composited over the background, or are masked out, or count as if they were opaque.
+ALPHA_USES = ("background", "mask", "ignore")
 
 # Arguments of `load_scene`, besides the path and the background, that a run records to read its scene again.
 READING_OPTIONS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval", "origin", "bars", "rim")

@@ -42,7 +42,7 @@ class PhotoReader:
     photo : the photo's name, pose and lens.
     file : its file. size : its (width, height) as read, before `resolution` [px].
     mask_file : file of its mask, if it has one.
-    alpha_hides : whether transparency is a mask.
+    alpha_hides : whether transparency is a mask. alpha_counts : whether it counts at all.
     bars : bars of the photo, which are masked out.
     upright : whether the photo is turned by its EXIF orientation.
     rim : pixels of a rim around the photo, (H, W), which are masked out; None without a rim.
@@ -58,6 +58,7 @@ class PhotoReader:
     bars: Bars = NO_BARS
     upright: bool = False
     rim: Mask | None = field(default=None, compare=False)
+    alpha_counts: bool = True
 
     @classmethod
     def of(
@@ -70,11 +71,12 @@ class PhotoReader:
         alpha_hides: bool = False,
         bars: Bars = NO_BARS,
         rim: Mask | None = None,
+        alpha_counts: bool = True,
     ) -> PhotoReader:
         """Return the reader of one of the photos of a scene."""
         name = photo.name
         file, size, upright = posed.files[name], posed.sizes[name], name in posed.upright
-        return cls(photo, file, size, resolution, background, mask_file, alpha_hides, bars, upright, rim)
+        return cls(photo, file, size, resolution, background, mask_file, alpha_hides, bars, upright, rim, alpha_counts)
 
     @property
     def decoding_bytes(self) -> int:
@@ -115,6 +117,8 @@ class PhotoReader:
             look(stored)
         masks = self._stored_masks()
         alpha = None
+        if not self.alpha_counts:
+            stored = stored[:, :, :3]
         if stored.shape[2] == 4:
             alpha = stored[:, :, 3].copy()  # a slice would keep the whole photo in memory
             if self.alpha_hides:

@@ -156,10 +156,9 @@ def load_scene(
     background : colour 0..1 under transparent pixels.
     masks : folder of masks inside the scene (see files/masks.py), or "none" for no masks. By default "masks" if it
         exists, the masks named in transforms.json, and masks beside photos. "none" keeps bars and rims, too.
-    alpha : use of a photo's transparency. "background" composites the photo over the background; "mask" masks out
-        pixels that are less than half opaque. By default it is "background", but "mask" if the same pixels are
-        transparent in all photos and points lie there: rims that undistortion leaves without data. So it is if some
-        photos have transparent parts and others are opaque: something was cut out there.
+    alpha : use of a photo's transparency. "background" composites the photo over the background, "mask" masks out
+        pixels that are less than half opaque, and "ignore" takes all as opaque. By default the photos and points
+        decide: see `use_of_alpha` in without_data.py.
     read_photos : whether to decode the training photos now and keep them. Photos of test views, or all of them, are
         decoded at each use instead (`View.loaded`).
     only : names of the photos to read, for a part of a large scene. The files of the others are not opened, except for
@@ -215,6 +214,7 @@ def load_scene(
             mask_of.get(photo.name),
             alpha == "mask",
             *((bars, found) if posed.sizes[photo.name] == usual_size else (NO_BARS, None)),
+            alpha != "ignore",
         )
         for photo in photos
     ]

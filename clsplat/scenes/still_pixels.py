@@ -28,7 +28,7 @@ MOST_OF_RIM = 0.8  # of a photo, if what all photos show has the same outline
 ALIKE_OUTLINES = 0.9  # of what any photo shows, the mean share that a photo shows: those of objects differ
 # Least points a pixel, in units of the mean of the photo. Points gather in the middle of photos, far from rims.
 DENSITY = 0.03
-_EMPTY = 8  # largest alpha of a pixel without data
+EMPTY = 8  # largest alpha of a pixel without data
 _ALIKE = 0.8  # of the transparent pixels of photos, those that all photos have in common; silhouettes of objects differ
 
 
@@ -103,7 +103,7 @@ def still_pixels(views: Sequence[View]) -> tuple[Mask, bool, bool]:
         if photo.mask is not None:
             counted &= photo.mask
         if empty is not None and photo.alpha is not None:
-            part = photo.alpha <= _EMPTY
+            part = photo.alpha <= EMPTY
             transparent += int(np.count_nonzero(part))
             empty = empty & part
         else:

@@ -24,7 +24,7 @@ from .bars import NO_BARS, Bars, commonest_size, find_bars
 from .options import ALPHA_USES
 from .posed_images import PosedImages
 from .read_view import PhotoReader
-from .still_pixels import DENSITY, FEWEST_VIEWS, hide_points, pixels_before_scene
+from .still_pixels import DENSITY, EMPTY, FEWEST_VIEWS, hide_points, pixels_before_scene
 from .undistort import RegisteredImage
 from .view import StoredView, View
 
@@ -36,7 +36,7 @@ _MOST_CUT, _MOST_CUT_WITHOUT_POINTS = 0.9, 0.5
 class AlphaUse(NamedTuple):
     """What transparency means, one of ALPHA_USES, and the views that were read to find out, by name.
 
-    The views are composited over the background. If transparency is a mask, the mapping is empty.
+    The views are composited over the background. If transparency means something else, the mapping is empty.
     """
 
     use: str
@@ -48,7 +48,10 @@ def use_of_alpha(
 ) -> AlphaUse:
     """Return what the transparency of the photos means, and warn if it means that data is missing.
 
-    The photos of all views are looked at, so that a part of a scene is read as the whole.
+    It is "mask" if the same pixels are transparent in all photos, and points lie there: rims without data. So it is if
+    some photos have transparent parts, and others are opaque: something was cut out there. It is "ignore" if all pixels
+    of all photos are transparent. Else it is "background". The photos of all views are looked at, so that a part of a
+    scene is read as the whole.
 
     Parameters
     ----------
@@ -65,6 +68,13 @@ def use_of_alpha(
             found = sample.rims()
         if found is None and photos:
             found = sample.cut_outs(len(photos), len(posed.photos))
+        if len(photos) == len(posed.photos) and sample.show_nothing:
+            warnings.warn(
+                f"{root}: all pixels of all photos are transparent: their alpha channel says nothing, and is ignored "
+                '(alpha "ignore")',
+                stacklevel=4,
+            )
+            return AlphaUse(ALPHA_USES[2], {})
     if found is None:
         return AlphaUse(ALPHA_USES[0], decoded)
     warnings.warn(
@@ -98,6 +108,7 @@ class _TransparentPhotos:
         self.xyz, self.kept, self.decoded = xyz, kept, decoded
         self.views = [StoredView(reader.photo.name, reader.camera(), partial(self._read, reader)) for reader in readers]
         self._parts: dict[str, _Part | None] = {}  # of the photos that were decoded; None for opaque ones
+        self._empty: dict[str, bool] = {}  # whether these photos show nothing
 
     def _read(self, reader: PhotoReader) -> View:
         view = reader.view(partial(self._look, reader))
@@ -113,6 +124,12 @@ class _TransparentPhotos:
             within = np.count_nonzero(~opaque[found.rows_and_columns])
             part = _Part(1.0 - float(opaque.mean()), int(np.count_nonzero(found.inside)), int(within))
         self._parts[reader.photo.name] = part
+        self._empty[reader.photo.name] = stored.shape[2] == 4 and int(stored[:, :, 3].max()) <= EMPTY
+
+    @property
+    def show_nothing(self) -> bool:
+        """Whether all photos show nothing, if all were decoded. Recordings of games have such an alpha channel."""
+        return len(self._empty) == len(self.views) > 0 and all(self._empty.values())
 
     def rims(self) -> str | None:
         """Return words for pixels that are transparent in all photos where points of the scene lie, or None."""

@@ -87,7 +87,9 @@ def test_cameras_that_look_ahead_and_all_cameras_in_one_place() -> None:
 
 def test_centres_that_differ_by_rounding_are_one_place() -> None:
     place = np.array([3.6, 0.1, 0.7])
-    turned = [camera(place, place + (np.cos(angle), np.sin(angle), 0.3 * angle)) for angle in np.arange(12) / 2]
+    turned = [
+        camera(place, place + np.array([np.cos(angle), np.sin(angle), 0.3 * angle])) for angle in np.arange(12) / 2
+    ]
     assert 0 < published(turned) < 1e-14
     assert extent_of(turned, NOTHING) == 1.0
 

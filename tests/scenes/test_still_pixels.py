@@ -72,6 +72,28 @@ def test_a_part_of_a_scene_is_read_as_the_whole(rims: Path) -> None:
     assert scene.reading["alpha"] == "mask"
 
 
+def test_photos_that_are_transparent_everywhere_count_as_opaque(rims: Path, tmp_path: Path) -> None:
+    opaque = load_scene(rims, alpha="ignore")
+    assert opaque.train[0].alpha is None
+    assert opaque.train[0].mask is None
+    for file in (rims / "images").iterdir():
+        pixels = read_image(file)
+        pixels[..., 3] = 0
+        write_png(file, pixels)
+    scene, said = scene_and_warnings(rims)
+    assert "all pixels of all photos are transparent: their alpha channel says nothing, and is ignored" in said
+    assert scene.reading["alpha"] == "ignore"
+    assert all(np.array_equal(view.image, other.image) for view, other in zip(scene.train, opaque.train, strict=True))
+    model = tmp_path / "m"
+    clsplat("train", rims, "-m", model, "--eval", "-q", *SHORT)
+    assert "all pixels of all photos" not in run("eval", model).stderr, "it is recorded"
+    for file in (rims / "images").iterdir():
+        pixels = read_image(file)
+        pixels[10, 10, 3] = 200
+        write_png(file, pixels)
+    assert scene_and_warnings(rims)[0].reading["alpha"] == "background", "the photos show something"
+
+
 def test_photos_of_an_object_stay_transparent(rims: Path) -> None:
     """Their silhouettes differ, or no points lie around them."""
     for number, file in enumerate(sorted((rims / "images").iterdir())):
