@@ -17,6 +17,7 @@ from ..files.images import image_size, read_image
 from .colmap import NO_POINTS, Points
 from .extent import together
 from .origin import FAR
+from .pose_axes import warn_of_convention
 from .posed_images import PosedImages
 
 _MAX_POINT = 1e30  # the largest coordinate of a point; float32 ends at 3e38
@@ -72,6 +73,7 @@ def without_unseen_points(root: Path, points: Points, cameras: Sequence[Camera])
     """
     if not len(points):
         return points
+    warn_of_convention(root, points, cameras)
     sample = sampled(points.xyz)
     shown = np.zeros(len(sample), np.bool_)
     for camera in cameras:
