@@ -12,9 +12,10 @@ from typing import Any
 from ..errors import InputError, Remedy
 from ..files.masks import NO_MASKS
 from ..scenes.few_photos import few_photos
+from ..scenes.held_out import select_test_names
 from ..scenes.options import TEST_EVERY
 from ..scenes.photo_size import target_size
-from ..scenes.scene import Scene, load_scene, read_posed_images, select_test_names
+from ..scenes.scene import Scene, load_scene, read_posed_images
 from ..scenes.transforms_files import TEST, TRAIN
 from ..splats.color import Color
 from .sets import BLENDER, BenchmarkSet, SetScene

@@ -17,12 +17,13 @@ from ..files.image_names import IMAGE_SUFFIXES
 from ..files.json_file import read_json, to_real
 from ..files.real_path import real_path
 from .colmap_folder import colmap_folder
+from .held_out import select_test_names
 from .options import TEST_EVERY
 from .photo_listing import list_images
 from .pose_checks import check_lenses
 from .posed_images import PosedImages
 from .reconstruct.options import RECORD
-from .scene import find_masks, read_posed_images, select_test_names
+from .scene import find_masks, read_posed_images
 from .scene_files import SCENE_ENDINGS, described_by, find_scene_files
 from .undistort import is_pinhole
 

@@ -18,7 +18,6 @@ from ..files.digest import file_digest
 from ..files.images import ImageU8
 from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files, masks_beside, warn_of_unused
 from ..files.real_path import real_path
-from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
 from .bars import NO_BARS, checked_bars, commonest_size
 from .colmap import Points
@@ -26,6 +25,7 @@ from .colmap_folder import colmap_folder, model_suffix
 from .described import read_described
 from .distinct_points import without_copies
 from .extent import extent_of
+from .held_out import select_test_names
 from .options import ALPHA_USES, ORIGIN, TEST_EVERY
 from .origin import near_origin, size_of
 from .photo_size import check_memory, check_resolution
@@ -360,45 +360,3 @@ def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | 
 def _needs_hint(root: Path, images: str | None) -> bool:
     """Return whether a folder cannot be read as a scene. A model alone is one if its folder of photos is named."""
     return colmap_folder(root) is None and not (images is not None and model_suffix(root))
-
-
-def select_test_names(posed: PosedImages, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:
-    """Return the names of the test views; parameters as `load_scene`, raises InputError."""
-    names = posed.listed
-    if test_list is None and posed.test_names is not None:
-        chosen = sorted(posed.test_names)
-        if test_every != TEST_EVERY:
-            warnings.warn(
-                f"test_every {test_every} has no effect: the scene's files name its test views; a test_list replaces "
-                "them",
-                stacklevel=3,
-            )
-    elif test_list is None:
-        if test_every < 2:
-            raise InputError(f"test_every {test_every}: must be at least 2; to train on all views, turn eval off")
-        chosen = names[::test_every]
-    else:
-        chosen = _read_names(Path(test_list))
-        unknown = [name for name in chosen if name not in set(names)]
-        if unknown:
-            raise InputError(
-                f"{test_list}: no view is named {unknown[0]!r} ({len(unknown)} unknown in all); "
-                f"names look like {names[0]!r}"
-            )
-    if len(set(chosen)) == len(names):
-        folder = next((file.parent for file in posed.files.values()), "the scene")
-        raise InputError(
-            f"{folder}: no training view is left: all {len(names)} views are test views; choose fewer, or turn eval off"
-        )
-    return frozenset(chosen)
-
-
-def _read_names(path: Path) -> list[str]:
-    try:
-        lines = read_whole(path).decode("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
-        raise InputError(
-            f"{path}: cannot be read as a list of names ({reason}); give a text file with one image name per line"
-        ) from None
-    return [line.strip() for line in lines if line.strip()]

@@ -37,6 +37,7 @@ NAMED_IN = {
     "scenes/reconstruct/panoramas.py": ("reconstruct",),
     "scenes/reconstruct/photo_files.py": ("reconstruct",),
     "scenes/reconstruct/reconstruct.py": ("reconstruct", "train"),
+    "training/average.py": ("train",),
     "training/checkpoint.py": ("train",),
     "training/exposure.py": ("train",),
     "training/initialise.py": TRAINING,
