@@ -18,7 +18,7 @@ from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.floaters import measure_floaters
 from ..evaluation.metrics import check_sizes
-from ..files.host_memory import give_back_free_memory, peak_bytes
+from ..files.host_memory import peak_bytes
 from ..rendering.frame import Frame
 from ..rendering.renderer import Renderer
 from ..rendering.tuning import schedule_for
@@ -192,7 +192,6 @@ class Trainer:
             self.validation.resume(folder, self.iteration)
         started, since = time.perf_counter(), self.iteration
         shown = started
-        give_back_free_memory()  # of the start: the device has the splats and most photos now
         with stoppable(folder is not None) as stop:
             if self.progress is not None and (estimate := self.clock.first_estimate(self.iteration)):
                 self._send(estimate)
@@ -228,8 +227,6 @@ class Trainer:
                     self._measure_test_views(log)
                 if validated:
                     self.validation.measure(self.snapshot(), it, self.seconds, log, folder)
-                if ends:
-                    give_back_free_memory()  # before the model is copied to the host
                 if folder is not None and (it in config.output.save_iterations or ends):
                     self._save_model(folder)
                 if folder is not None and (ends or times.is_due(it)):
