@@ -6,13 +6,17 @@ Copies say nothing about the scene. Whoever counts or samples points would take 
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..splats.fields import DoubleArray
-from .colmap import Points
+
+if TYPE_CHECKING:
+    from .colmap import Points  # loads Pillow, which would slow down --help
 
 _MANY = 0.2  # part of the points that are copies: COLMAP's models have up to a sixteenth, which changes nothing
 
@@ -27,7 +31,7 @@ def without_copies(root: Path, points: Points) -> Points:
         "check that their coordinates have enough digits",
         stacklevel=4,
     )
-    return Points(points.xyz[apart], points.rgb[apart], points.track_length[apart])
+    return replace(points, xyz=points.xyz[apart], rgb=points.rgb[apart], track_length=points.track_length[apart])
 
 
 def distinct(xyz: DoubleArray) -> NDArray[np.int64]:
