@@ -176,3 +176,5 @@ def test_the_context_is_never_removed(scene: Scene, parts: tuple[Path, Splats]) 
     assert trainer.splats.n == n - 1
     for name, array in context.arrays.items():
         assert (trainer.snapshot().arrays[name][-len(context) :] == array).all(), name
+    trainer.density.remove(np.ones(n - 1, np.bool_))
+    assert trainer.splats.n == n - 1, "as without a context: a run keeps its splats if all are to go"

@@ -81,7 +81,7 @@ class DensityControl:
         """Remove splats. gone : (N,). The statistics of the others stay. Frozen splats are never removed."""
         frozen = np.arange(self.splats.n_live, self.splats.n)
         gone = gone[: self.splats.n_live]
-        if not gone.any() or (gone.all() and not len(frozen)):
+        if not gone.any() or gone.all():
             return
         self.optimizer.settle()
         kept, statistics = np.flatnonzero(~gone), self.statistics.read(self.splats.n)
