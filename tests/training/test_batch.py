@@ -92,7 +92,13 @@ def test_parts_of_a_device_have_the_bits_of_the_whole(
     assert_same_bits(whole.splats, parts.splats)
 
 
-@pytest.mark.parametrize("options", [{}, {"strategy": "mcmc", "exposure": True}], ids=["adc", "mcmc"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, marks=pytest.mark.slow, id="adc"),
+        pytest.param({"strategy": "mcmc", "exposure": True}, id="mcmc"),
+    ],
+)
 def test_devices_that_count_as_gpus_have_the_bits_of_one(
     scene: Scene, halves: str, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
 ) -> None:
