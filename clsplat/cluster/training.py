@@ -14,7 +14,6 @@ from ..files.lock import folder_lock
 from ..files.real_path import real_path
 from ..scenes.scene import Scene
 from ..scenes.source import SceneSource
-from ..splats.splats import Splats
 from ..training.checkpoint import UnusableCheckpoint
 from ..training.config import TrainConfig
 from ..training.folder import ModelFolder
@@ -72,7 +71,7 @@ def train_in_folder(
     KeyboardInterrupt : the run was stopped; its checkpoint is saved. Others are those of `train`.
     """
     stored = ModelFolder(folder)
-    file, n_context = stored.checkpoint_path, 0 if context is None else len(Splats.load(context))
+    file = stored.checkpoint_path
     try:
         resume = holds_run(stored, config)
         if file.is_file() and not resume and progress is not None:
@@ -85,7 +84,7 @@ def train_in_folder(
             resume=resume,
             overwrite=not resume,
             visit=visit,
-            context=context if n_context else None,
+            context=context,
         )
     except UnusableCheckpoint as error:
         raise InputError(f"{file}: {error.message.removeprefix(f'{file}: ')}", THIS_STAGE) from None
@@ -94,8 +93,8 @@ def train_in_folder(
     if not stored.ply_path(model.iteration).is_file():  # somebody has removed it since the run ended
         stored.save(model.splats, model.iteration)
     return {
-        "splats": len(model.splats) - n_context,
-        "context": n_context,
+        "splats": len(model.splats) - model.n_context,
+        "context": model.n_context,
         "seconds": round(model.seconds, 2),
         "peak_bytes": model.peak_bytes,
         "device_bytes": model.device_bytes,

@@ -19,6 +19,7 @@ from ..files.images import ImageU8, has_alpha, is_whole, read_image, resize_area
 from ..files.masks import Mask, read_mask, resize_mask
 from ..splats.color import Color
 from .bars import NO_BARS, Bars
+from .options import ALPHA_USES
 from .photo_size import target_size
 from .posed_images import PosedImages
 from .undistort import RegisteredImage, is_pinhole
@@ -42,7 +43,7 @@ class PhotoReader:
     photo : the photo's name, pose and lens.
     file : its file. size : its (width, height) as read, before `resolution` [px].
     mask_file : file of its mask, if it has one.
-    alpha_hides : whether transparency is a mask. alpha_counts : whether it counts at all.
+    alpha : use of its transparency, one of ALPHA_USES.
     bars : bars of the photo, which are masked out.
     upright : whether the photo is turned by its EXIF orientation.
     rim : pixels of a rim around the photo, (H, W), which are masked out; None without a rim.
@@ -54,11 +55,10 @@ class PhotoReader:
     resolution: int
     background: Color
     mask_file: Path | None
-    alpha_hides: bool
+    alpha: str = ALPHA_USES[0]
     bars: Bars = NO_BARS
     upright: bool = False
     rim: Mask | None = field(default=None, compare=False)
-    alpha_counts: bool = True
 
     @classmethod
     def of(
@@ -68,15 +68,19 @@ class PhotoReader:
         resolution: int,
         background: Color,
         mask_file: Path | None = None,
-        alpha_hides: bool = False,
+        alpha: str = ALPHA_USES[0],
         bars: Bars = NO_BARS,
         rim: Mask | None = None,
-        alpha_counts: bool = True,
     ) -> PhotoReader:
         """Return the reader of one of the photos of a scene."""
         name = photo.name
         file, size, upright = posed.files[name], posed.sizes[name], name in posed.upright
-        return cls(photo, file, size, resolution, background, mask_file, alpha_hides, bars, upright, rim, alpha_counts)
+        return cls(photo, file, size, resolution, background, mask_file, alpha, bars, upright, rim)
+
+    @property
+    def alpha_hides(self) -> bool:
+        """Whether transparency is a mask."""
+        return self.alpha == "mask"
 
     @property
     def decoding_bytes(self) -> int:
@@ -117,7 +121,7 @@ class PhotoReader:
             look(stored)
         masks = self._stored_masks()
         alpha = None
-        if not self.alpha_counts:
+        if self.alpha == "ignore":
             stored = stored[:, :, :3]
         if stored.shape[2] == 4:
             alpha = stored[:, :, 3].copy()  # a slice would keep the whole photo in memory

@@ -212,9 +212,8 @@ def load_scene(
             resolution,
             background,
             mask_of.get(photo.name),
-            alpha == "mask",
+            alpha,
             *((bars, found) if posed.sizes[photo.name] == usual_size else (NO_BARS, None)),
-            alpha != "ignore",
         )
         for photo in photos
     ]

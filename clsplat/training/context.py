@@ -6,6 +6,8 @@ the splats before them, and only these have moments.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from ..errors import InputError, Remedy
@@ -14,6 +16,12 @@ from ..splats.splats import Splats
 from .checkpoint import Checkpoint, UnusableCheckpoint
 from .config import TrainConfig
 from .options.density import Adc
+
+
+def context_of(context: Splats | Path | None) -> Splats | None:
+    """Return the splats of a context, which may be a file of them; None if there are none."""
+    splats = Splats.load(context) if isinstance(context, Path) else context
+    return splats if splats is not None and len(splats) else None
 
 
 def check_context(context: Splats | None, config: TrainConfig, checkpoint: Checkpoint | None = None) -> None:

@@ -25,6 +25,7 @@ class Model:
     path : the model folder, or None.
     best_iteration : iteration that was best on the validation views; 0 without the option `validate`.
     left_out : names of training views that the run left out because they disagree with all others.
+    n_context : number of splats that the run did not change (training/context.py), the last ones.
     """
 
     splats: Splats
@@ -38,6 +39,7 @@ class Model:
     path: Path | None = None
     best_iteration: int = 0
     left_out: tuple[str, ...] = ()
+    n_context: int = 0
 
     @property
     def finished(self) -> bool:

@@ -32,7 +32,7 @@ from .batch import Batch, Photo, check_batch
 from .checkpoint import Checkpoint
 from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
-from .context import check_context
+from .context import check_context, context_of
 from .density.control import DensityControl, ExplorationNoise
 from .exposure import KEY as EXPOSURE
 from .exposure_file import exposures_json
@@ -88,7 +88,7 @@ class Trainer:
         device: Device | None = None,
         context: Splats | Path | None = None,
     ) -> None:
-        context = Splats.load(context) if isinstance(context, Path) else context
+        context = context_of(context)
         check_context(context, config, checkpoint)
         scene = split_for_run(scene, config.validation.validate)
         if not scene.train:
@@ -253,6 +253,7 @@ class Trainer:
             None if folder is None else folder.path,
             self.validation.best.iteration,
             tuple(self.outliers.left_out),
+            self.n_frozen,
         )
 
     def _measure_test_views(self, log: RunLog) -> None:
